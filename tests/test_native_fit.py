@@ -54,8 +54,8 @@ def by_tensors(fit, *arguments):
 def test_a_fit_is_that_of_tensor_operations(steps):
     fit, *arguments = given()
     found, wanted = fit(*arguments, steps), by_tensors(fit, *arguments, steps)
-    assert len(fit.levels) == 3 and float(wanted.quality.amax()) > 0.9 and float(wanted.quality.amin()) < 0.5
-    for name, tolerance in dict(centre=5e-4, growth=5e-4, quality=2e-4).items():
+    assert len(fit.levels) == 3 and float(wanted.explained.amax()) > 0.9 and float(wanted.contrast.amin()) < 0.1
+    for name, tolerance in dict(centre=5e-4, growth=5e-4, explained=2e-4, contrast=2e-4, misfit=5e-3).items():
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=0, atol=tolerance)
     torch.testing.assert_close(found.covariance, wanted.covariance, rtol=1e-2, atol=1e-6)
 

@@ -5,10 +5,8 @@ import pytest
 import torch
 
 from torchmembrane.machine_code import using
-from torchmembrane.markers.dots.coherence import Coherence
 from torchmembrane.markers.dots.flow import FlowAverages
 from torchmembrane.markers.dots.match import DotMatcher
-from torchmembrane.markers.noise import pixel_noise
 
 COUNT, FRAMES, PITCH = 30, 3, 20.0
 GENERATOR = np.random.default_rng(0)
@@ -55,32 +53,6 @@ def test_choices_are_those_of_tensor_operations():
     assert ((wanted[0] > 0.3).sum() > COUNT) and ((wanted[0] < 0.02).sum() > 5)
     for one, other in zip(found, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("torn", [False, True])
-def test_trust_is_that_of_tensor_operations(torn):
-    """Of matches with lost dots, blobs left over beside some, and strays; torn: half of them a pitch off."""
-    coherence = Coherence(PIXELS, np.zeros(COUNT), 0.3).float()
-    pixels = torch.as_tensor(PIXELS + GENERATOR.normal(0, 0.3, (FRAMES, COUNT, 2))).float()
-    pixels = pixels + PITCH * torn * (torch.arange(COUNT) % 6 > 2)[:, None]
-    pixels[:, 7] += 15.0
-    predicted = pixels + torch.as_tensor(GENERATOR.normal(0, 0.5, pixels.shape)).float()
-    blobs = torch.cat([pixels, predicted[:, ::5] + 1.0, pixels[:, ::4] + 9.0], 1)
-    log_radius = torch.as_tensor(GENERATOR.normal(0, 0.2, blobs.shape[:2])).float()
-    gradient = torch.as_tensor(GENERATOR.normal(0, 0.03, (FRAMES, COUNT, 2, 2))).float()
-    found, wanted = both(coherence, pixels, weights(), gradient, predicted, blobs, log_radius, torch.ones_like(log_radius))
-    assert float(wanted.amin()) < 0.1 and (torn or float(wanted.amax()) > 0.9)
-    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
-
-
-def test_noise_is_that_of_tensor_operations():
-    """Of images with edges, and with parts where noise is cut off."""
-    images = torch.as_tensor(0.5 + GENERATOR.normal(0, 1, (2, 1, 90, 71)) * np.array([0.01, 0.04])[:, None, None, None]).float()
-    images[:, :, 20:40] += 0.3
-    images[:, :, :, 50:] = 1.2 * images[:, :, :, 50:] + 0.4
-    found, wanted = both(pixel_noise, images)
-    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=0)
-    assert 0.008 < float(wanted[0]) < 0.02 and 0.03 < float(wanted[1]) < 0.06
 
 
 def test_what_records_gradients_is_left_to_tensors():

@@ -68,7 +68,7 @@ def nudged(locator, by):
         (locator.detect, "forward"),
         (locator.match, "gradient"),
         (locator.match, "predict"),
-        (locator.coherence, "forward"),
+        (locator.match.neighbour_steps, "forward"),
     ]
     s = scene()
     image = batch(render(*deform(s, slide, 0.4)))

@@ -1,11 +1,7 @@
 """How noisy images are."""
 
-import numpy as np
 import torch
 from torch import Tensor
-
-from ..machine_code import takes
-from .native_noise import kept_noises, noises
 
 STRIDE = 7  # px, between the places that are asked: at every phase of blocks of 8
 GAIN = 6  # of the second difference in u of that in v, in noise (Immerkaer 1996)
@@ -28,11 +24,6 @@ def pixel_noise(images: Tensor) -> Tensor:
         >>> round(pixel_noise(0.5 + 0.02 * noise).item(), 3)
         0.02
     """
-    if images.dtype == torch.float32 and takes(images):
-        found = images.new_empty(len(images))
-        with kept_noises.compiling(np.dtype(np.float32)):
-            noises(images[:, 0].contiguous().numpy(), STRIDE, EXPOSED, OUTLIER_FACTOR, ROUNDS, GAIN * BIAS, found.numpy())
-        return found
     size = _second_difference(_second_difference(images, -2), -1).abs()
     middle = images[..., 1:-1:STRIDE, 1:-1:STRIDE]
     size = torch.where((middle > EXPOSED[0]) & (middle < EXPOSED[1]), size, 2 * NO_LIMIT).flatten(1)[:, None]

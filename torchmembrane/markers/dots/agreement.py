@@ -7,17 +7,12 @@ from torch import Tensor, nn
 
 from ...control_flow import fori_loop, traced
 from ..spacing import spacing, square_distance
+from .scales import CANDIDATES, FAR, PREDICTION, REACH
 
-CANDIDATES = 24  # blobs among which a dot chooses
-REACH = 2.5  # pitches, of a candidate from where the dot is expected
 PULL = 2.0  # pitches: standard deviation of a dot from where it is expected; wide, it only decides between equals
-STRETCH = 0.3  # standard deviation of a step to a neighbour from the one expected, over its length
-DOUBT = 5.0  # what a dot costs that is lost, and a step that is wrong at most, as half the square of standard deviations
-SIZE = 4.5  # what a wrong size costs at most
+DOUBT = 5.0  # what a lost dot costs, and a wrong step or size at most, as half the square of standard deviations
 EXCHANGES = 20
 DAMPING = 0.3  # of the messages
-LONGEST = 2.5  # pitches, of an edge between neighbours
-FAR = 1e3
 
 
 def edges(pixels: np.ndarray) -> np.ndarray:
@@ -25,14 +20,14 @@ def edges(pixels: np.ndarray) -> np.ndarray:
     corners = Delaunay(pixels, qhull_options="QJ Pp").simplices  # joggled: dots may be in one row
     pairs = np.unique(np.sort(corners[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), 1), axis=0)
     length, pitch = np.linalg.norm(np.diff(pixels[pairs], axis=1)[:, 0], axis=1), spacing(pixels)[1]
-    return np.asarray(pairs[length < LONGEST * pitch[pairs].max(1)])
+    return np.asarray(pairs[length < REACH * pitch[pairs].max(1)])
 
 
 class NeighbourAgreement(nn.Module):
     """Assigns blobs to the dots of a pattern so that the steps between neighbours are as expected.
 
     Minimises over every dot's choice `k`, one of its candidates or none, `sum_d c_d(k_d) + sum_(d,e) min(|r_de|^2 / 2 s_de^2,
-    DOUBT)`. `r_de` is the step from blob `k_d` to blob `k_e` less the one expected, `s_de` is `STRETCH` times its length at
+    DOUBT)`. `r_de` is the step from blob `k_d` to blob `k_e` less the one expected, `s_de` is `PREDICTION` times its length at
     rest.
     Loopy min-sum belief propagation (Pearl 1988; Weiss and Freeman 2001): messages along the edges are exchanged a fixed number
     of times. It knows no membrane: any flow will do whose steps change by up to about half from one dot to the next.
@@ -67,7 +62,7 @@ class NeighbourAgreement(nn.Module):
         self.register_buffer("target", torch.as_tensor(target.copy()))
         self.register_buffer("reverse", torch.as_tensor(np.roll(np.arange(2 * count), count)))
         self.register_buffer("incoming", torch.as_tensor(incoming))
-        self.register_buffer("narrowness", torch.as_tensor(0.5 / (STRETCH * np.tile(length, 2)) ** 2)[:, None, None])
+        self.register_buffer("narrowness", torch.as_tensor(0.5 / (PREDICTION * np.tile(length, 2)) ** 2)[:, None, None])
         self.register_buffer("pull", torch.as_tensor(0.5 / (PULL * pitch) ** 2)[:, None])
         self.register_buffer("lost", torch.as_tensor(DOUBT * seen.astype(float))[:, None])
         self.register_buffer("reach", torch.as_tensor((REACH * pitch) ** 2)[:, None])
@@ -93,7 +88,7 @@ class NeighbourAgreement(nn.Module):
         `[B, E, C + 1, C + 1]`, first messages `[B, E, C + 1]`."""
         middle = expected.mean(1, keepdim=True)
         square = square_distance(expected - middle, blobs - middle)
-        cost = square * self.pull + (0.5 * misfit).clamp(max=SIZE) + FAR * (square > self.reach).to(square.dtype)
+        cost = square * self.pull + (0.5 * misfit).clamp(max=DOUBT) + FAR * (square > self.reach).to(square.dtype)
         value, index = cost.topk(min(CANDIDATES, cost.shape[-1]), largest=False)
         places = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         offset = places - expected[:, :, None]

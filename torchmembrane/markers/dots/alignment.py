@@ -8,15 +8,13 @@ from ...control_flow import traced
 from ...solve.elimination import solve_dense
 from ..neighbourhood import weighted_median
 from ..spacing import spacing, square_distance
+from .scales import CANDIDATES, NONE, REACH
 
-VOTERS = 32  # blobs near a dot that vote for a shift
-SHIFTS = 2.25  # pitches, the largest shift
 VOTE = 0.25  # pitches, width of a vote and distance of the shifts
 HOME = 4.0  # pitches: of two shifts with alike many votes the smaller is taken
-BETTER = 1.1  # votes of a start over those of the one before, to be taken
-WIDTHS = (0.5, 0.46, 0.42, 0.38, 0.34)  # pitches, in which the affine map looks for blobs
+FITS, WIDTH = 5, 0.4  # of the affine map, and pitches in which it looks for blobs
 STIFFNESS = 0.05  # of the affine map, per dot
-FAR = 1e3
+FAR = 1e3  # square pitches, by which a blob of another size is farther
 
 
 class Alignment(nn.Module):
@@ -40,7 +38,7 @@ class Alignment(nn.Module):
 
     def __init__(self, pixels: np.ndarray, seen: np.ndarray):
         super().__init__()
-        shifts = np.arange(-SHIFTS, SHIFTS + VOTE / 2, VOTE)
+        shifts = np.arange(-REACH, REACH + VOTE / 2, VOTE)
         self.register_buffer("pixels", torch.as_tensor(pixels))
         self.register_buffer("unit", torch.as_tensor(np.median(spacing(pixels)[0])))
         self.register_buffer("shifts", torch.as_tensor(shifts))
@@ -66,15 +64,15 @@ class Alignment(nn.Module):
         typical = weighted_median(deformation.flatten(1, 2).mT, valid).unflatten(-1, (2, 2))
         before, votes = self.shifted(before, blobs, weight)
         mapped, others = self.shifted(self.pixels @ typical.mT, blobs, weight)
-        place = torch.where((others > BETTER * votes)[:, None, None], mapped, before)
-        for width in WIDTHS:
-            place = self.mapped(place, blobs, weight, width * self.unit)
+        place = torch.where((others > votes)[:, None, None], mapped, before)
+        for _ in range(FITS):
+            place = self.mapped(place, blobs, weight, WIDTH * self.unit)
         return place
 
     def shifted(self, place: Tensor, blobs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """`place [B, D, 2]` after the shift with the most votes, and these `[B]`."""
         square = square_distance(place, blobs)
-        index = (square + FAR * self.unit**2 * (1 - weight)).topk(min(VOTERS, blobs.shape[1]), largest=False).indices
+        index = (square + FAR * self.unit**2 * (1 - weight)).topk(min(CANDIDATES, blobs.shape[1]), largest=False).indices
         there = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         offset = ((there - place[:, :, None]) / self.unit).flatten(1, 2)
         along_u, along_v = torch.exp(-((offset[..., None] - self.shifts) / VOTE).square() / 2).unbind(2)
@@ -87,7 +85,7 @@ class Alignment(nn.Module):
     def mapped(self, place: Tensor, blobs: Tensor, weight: Tensor, width: Tensor) -> Tensor:
         """`place [B, D, 2]` after a step of an affine map onto the blobs within about `width` px."""
         near = torch.exp(-square_distance(place, blobs) / (2 * width**2)) * weight
-        near = near / (near.sum(-1, keepdim=True) + 0.1)
+        near = near / (near.sum(-1, keepdim=True) + NONE)
         near = near / near.sum(1, keepdim=True).clamp_min(1)  # a blob is one dot's
         total = near.sum(-1, keepdim=True)
         away = near @ blobs - total * place

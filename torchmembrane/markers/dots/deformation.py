@@ -6,10 +6,13 @@ from torch import Tensor, nn
 
 from ...control_flow import fori_loop, traced
 from ..spacing import FADED, neighbours, spacing, square_distance
+from .scales import FAR, NONE
 
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
-NEIGHBOURS = 8
-FAR = 1e6
+NEIGHBOURS = 8  # that are mapped
+BESIDE = 12  # blobs on which they are laid
+AVERAGE = 0.8  # pitches, over which a deformation is averaged
+RIDGE = 0.2  # draws a fit to the one before
 
 
 def monomial_map() -> Tensor:
@@ -51,7 +54,7 @@ class LocalDeformation(nn.Module):
         self.register_buffer("around", torch.as_tensor(np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)], 1)))
         self.register_buffer("pitch", torch.as_tensor(pitch))
         self.register_buffer("monomial_map", monomial_map())
-        self.register_buffer("ridge", torch.tensor([[0.2], [0.0], [0.2], [0.0]], dtype=torch.float64))
+        self.register_buffer("ridge", torch.tensor([[RIDGE], [0.0], [RIDGE], [0.0]], dtype=torch.float64))
         self.register_buffer("identity", torch.tensor([[1e-6], [0.0], [0.0], [1e-6], [1e-6]], dtype=torch.float64))
 
     def forward(self, blobs: Tensor, valid: Tensor) -> Tensor:
@@ -74,14 +77,14 @@ class LocalDeformation(nn.Module):
         own = square_distance(blobs - middle, self.pixels - middle).argmin(-1)
         around, pitch = self.around[own], self.pitch[own]
         apart = square_distance(blobs - middle, blobs - middle)
-        index = (apart + FAR * (1 - valid[:, None])).topk(min(13, blobs.shape[1]), largest=False).indices[..., 1:]
+        index = (apart + FAR * (1 - valid[:, None])).topk(min(1 + BESIDE, blobs.shape[1]), largest=False).indices[..., 1:]
         known = torch.cat([blobs.mT, valid[:, None]], 1).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1))
         position, there = known.unflatten(2, index.shape[1:]).split([2, 1], 1)
         others = (position - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, 12]
         square = others.square().sum(1, keepdim=True)
         away = torch.cat([-2 * others, torch.ones_like(square), square], 1)
         beside = torch.cat([others * there, there], 1)
-        nearby = torch.exp((apart / (-2 * (0.8 * pitch[:, None]) ** 2)).clamp_min(-FADED)) * valid[..., None]
+        nearby = torch.exp((apart / (-2 * (AVERAGE * pitch[:, None]) ** 2)).clamp_min(-FADED)) * valid[..., None]
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
         return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
@@ -95,9 +98,9 @@ class LocalDeformation(nn.Module):
         entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
         mapped = (entries * (-0.5 / width**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
         target = beside @ torch.exp((away.mT @ mapped).clamp_min(-FADED))
-        target = target / (target[:, :, 2:] + 0.1)  # weight times position, weight: [B, K, 3, M]
+        target = target / (target[:, :, 2:] + NONE)  # weight times position, weight: [B, K, 3, M]
         sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))
-        load = sums[:, :2, :2] + 0.2 * gradient
+        load = sums[:, :2, :2] + RIDGE * gradient
         uu, uv, vv, weight = (sums[:, 2, 2:] + self.ridge).unbind(1)
         fitted = load * torch.stack([vv, uu], 1)[:, None] - load.flip(2) * uv[:, None, None]
         quality = valid * (weight / around.shape[-1]).square()

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .bands import BandProduct, SeparableMap, blur_rows, linear_rows, pair_means
+from .probability import SHADE
 from .pyramid import LEVELS
 
 FINEST_SIGMA = 0.9  # of the blob detector on a level of the pyramid, pixels of the level
@@ -103,7 +104,7 @@ class BlobDetector(nn.Module):
 
     def forward(self, levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Locate blobs in `levels` of `mean_pyramid` with dark dots: centres `[B, K, 2]` px, log radius, strength `[B, K]`."""
-        background = self.background(levels[-1]) + 0.05
+        background = self.background(levels[-1]) + SHADE
         scales = [scale(levels) for scale in self.scales]
         peak = reduce(torch.maximum, scales) / background.square() * self.inside
         strength, cell = (peak * (peak == highest_around(peak, self.reach))).flatten(1).topk(self.count)

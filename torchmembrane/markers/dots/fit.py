@@ -10,12 +10,12 @@ from ...machine_code import takes
 from ...solve.elimination import solve_dense
 from ..spacing import spacing
 from .ellipse import SOFTNESS, half_axes, rms_half_axes
-from .native_fit import CONTRAST, EXPLAINED, MISFIT, STANDS_OUT, NativeFit
+from .native_fit import MISFIT, STANDS_OUT, NativeFit
 from .pyramid import LEVELS
 
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
 FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
-RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope over the dot, depth, shift, growth
+SLOPE, GROWTH = 100.0, 0.3  # ridges of the fit: of the background's slope over the dot, and of the dot's growth
 
 
 class Outline(NamedTuple):
@@ -29,13 +29,23 @@ class Outline(NamedTuple):
 
 
 class FittedDots(NamedTuple):
-    """Of a batch: `centre [B, D, 2]` px, its `covariance [B, D, 2, 2]` px^2, `growth` of the outline `[B, D]` px, `quality
-    [B, D]` in 0..1."""
+    """Of a batch.
+
+    Attributes:
+        centre: `[B, D, 2]`, px.
+        covariance: of the centre `[B, D, 2, 2]`, px^2.
+        growth: of the outline `[B, D]`, px.
+        explained: share of the window's variance, `[B, D]`, at most 1.
+        contrast: over the background `[B, D]`.
+        misfit: of the size, squared standard deviations `[B, D]`.
+    """
 
     centre: Tensor
     covariance: Tensor
     growth: Tensor
-    quality: Tensor
+    explained: Tensor
+    contrast: Tensor
+    misfit: Tensor
 
 
 class EllipseFit(nn.Module):
@@ -83,7 +93,7 @@ class EllipseFit(nn.Module):
         half = int(np.round(((long + ring) / stride).max()))
         self.native = NativeFit()
         self.half_width = min(half, (min(sizes[level].min(0)) - 1) // 2)
-        self.narrowness = -0.25 / size_tolerance**2
+        self.narrowness = size_tolerance**-2.0
         self._register_levels(level, _disc(self.half_width), sizes)
         sharpness = np.sqrt(stride) / SOFTNESS
         unit = sharpness / stride
@@ -95,13 +105,13 @@ class EllipseFit(nn.Module):
         self.register_buffer("fall", torch.as_tensor(2 / sharpness)[:, None])
         self.register_buffer("ring", torch.as_tensor(2 * ring / stride)[:, None])
         self.register_buffer("size", torch.as_tensor(rms_half_axes(shapes) * unit))
-        ridge = np.ones((len(stride), 1, 1)) * np.diag(RIDGE)
-        ridge[:, 1:3, 1:3] = RIDGE[1] * shapes @ shapes.swapaxes(1, 2) / stride[:, None, None] ** 2
+        ridge = np.ones((len(stride), 1, 1)) * np.diag([*6 * [1e-3], GROWTH])
+        ridge[:, 1:3, 1:3] = SLOPE * shapes @ shapes.swapaxes(1, 2) / stride[:, None, None] ** 2
         ridge[:, 4:] /= unit[:, None, None] ** 2
         self.register_buffer("ridge", torch.as_tensor(ridge))
         self.register_buffer("unit_loads", torch.eye(7, dtype=torch.float64)[:, 4:6])
         self.register_buffer("least", torch.tensor(1e-12, dtype=torch.float64))
-        farthest = torch.tensor([[-2.0, -2.0, -1.0], [2.0, 2.0, 1.6]], dtype=torch.float32)
+        farthest = torch.tensor([[-2.0, -2.0, -1.0], [2.0, 2.0, 1.6]])
         self.register_buffer("farthest", farthest[..., None, None])
 
     def _register_levels(self, level: np.ndarray, offset: np.ndarray, sizes: np.ndarray) -> None:
@@ -141,8 +151,7 @@ class EllipseFit(nn.Module):
             steps: Gauss-Newton steps.
 
         Returns:
-            The dots; their quality comes from the share of the window's variance explained, the contrast `a / b_0`, and the
-            size against that of `shape` or at rest.
+            The dots; the misfit of their size is that against `shape` or at rest, the less of them.
         """
         centre, shape, noise = (value.to(self.size) for value in (centre, shape, noise))
         if self.size.dtype == torch.float32 and takes(*levels, centre, shape, noise):
@@ -170,14 +179,14 @@ class EllipseFit(nn.Module):
             change = (change + torch.tanh(fit[4:] * gain / reach)).clamp(*self.farthest)
             moved, before = change * reach, (fit, gain)
         missed = _missed(gram, solved[..., :1])
-        quality = self._quality(gram, fit, missed, offset / self.sharpness, mean[..., 0])
+        explained, contrast = self._seen(gram, fit, missed, offset / self.sharpness, mean[..., 0])
         grown = size + moved[2]
         misfit = torch.minimum((grown / size).log().square(), (grown / self.size).log().square())
         scale = (gain[..., None] / self.unit).square()[..., None]
         variance = (noise[:, None, None] / self.stride).square()[..., 0] + MISFIT * missed / (gram[..., 0, 0] - 7).clamp_min(1)
         covariance = (variance[..., None, None] * scale) * solved[..., 4:6, 1:]
         moved = moved.movedim(0, -1) / self.unit
-        return FittedDots(centre + moved[..., :2], covariance, moved[..., 2], quality * torch.exp(misfit * self.narrowness))
+        return FittedDots(centre + moved[..., :2], covariance, moved[..., 2], explained, contrast, misfit * self.narrowness)
 
     def _to_circle(self, shape: Tensor) -> tuple[Tensor, Tensor]:
         """What takes an offset, and one in pixels of the level, to the unit circle and to the outline's normal, `[4, 4, B, D]`;
@@ -217,14 +226,12 @@ class EllipseFit(nn.Module):
         basis = torch.cat(fields).movedim(0, -2)
         return basis @ basis.mT
 
-    def _quality(self, gram: Tensor, fit: Tensor, missed: Tensor, offset: Tensor, mean: Tensor) -> Tensor:
-        """How well the model explains the window, times whether the dot stands out: `[B, D]` in 0..1."""
+    def _seen(self, gram: Tensor, fit: Tensor, missed: Tensor, offset: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """The share of the window's variance that the model explains, and the dot's contrast, `[B, D]`."""
         spread = gram[..., 7, 7] - gram[..., 0, 7].square() / gram[..., 0, 0].clamp_min(1)
         explained = 1 - missed / (spread.clamp_min(0) + 1e-6)
         background = (fit[1:3] * offset).sum(0)
-        contrast = -fit[3] / (fit[0] - background + mean).clamp_min(1e-2)
-        of_fit, of_contrast = EXPLAINED[0] * (explained - EXPLAINED[1]), CONTRAST[0] * (contrast - CONTRAST[1])
-        return torch.sigmoid(of_fit) * torch.sigmoid(of_contrast)
+        return explained, -fit[3] / (fit[0] - background + mean).clamp_min(1e-2)
 
 
 def _missed(gram: Tensor, fit: Tensor) -> Tensor:

@@ -9,28 +9,28 @@ from torch import Tensor, nn
 from ...control_flow import traced
 from ...errors import MembraneError
 from ..locator import LocatedMarkers
-from ..native_noise import kept_noises
 from ..noise import pixel_noise
-from ..spacing import partly_in_view, safe_length, spacing
-from .coherence import Coherence
+from ..spacing import partly_in_view, spacing
 from .detect import BlobDetector
 from .ellipse import draw_dots, size_tolerance
-from .fit import EllipseFit
-from .match import KEPT, DotMatcher
-from .native_coherence import kept_trusts
+from .fit import EllipseFit, FittedDots
+from .match import DotMatcher
 from .native_fit import kept_fits
 from .native_flow import KEPT_STEPS
-from .pattern import OUTLIER, DotPattern
+from .pattern import DotPattern
+from .probability import LEAST, alone, among_neighbours, contrast_evidence, whole_evidence
 from .pyramid import mean_pyramid
+from .scales import REACH
+from .seams import Seams
 
 STEPS = 3  # of the fit
 DIGITS = 8.0  # float32 has 20 binary ones after the point beside it
 BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
 """Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
 what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
-REACH = 2.5  # pitches: how far a dot is looked for from where it is at rest
-UNSEEN = 7.0  # odds against a dot that is fitted where no blob is
-FEWEST = 0.2  # mean confidence of a frame that is half trusted
+FAINT_BLOB = 0.4  # strength of a blob, over that of the frame's clearer ones, that is as likely a dot as none
+LARGEST_STRAIN = 0.6  # of the outlines from which the fit starts
+SPARE = 1.2, 16  # blobs that are wanted for each dot, and more
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
@@ -140,13 +140,13 @@ class DotLocator(nn.Module):
         self.fit = EllipseFit(pixels, shapes, image_size, tolerance)
         inside = membrane_mask(pixels, anchors, image_size)
         radii = np.sqrt(np.abs(np.linalg.det(shapes)))
-        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(1.2 * len(pixels)) + 16, inside)
+        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(SPARE[0] * len(pixels)) + SPARE[1], inside)
         drawn = mean_pyramid(draw_dots(pixels, shapes, image_size))
         blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
         blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
         own = cKDTree(blobs).query(pixels)[1]
         self.match = DotMatcher(pixels, log_radius[own], tolerance, partly_in_view(pixels, shapes, image_size))
-        self.coherence = Coherence(pixels, log_radius[own], tolerance)
+        self.seams = Seams(pixels, log_radius[own], tolerance)
         self.register_buffer("strength", torch.as_tensor(strength[own]))
         self.register_buffer("rest", torch.as_tensor(pixels))
         self.register_buffer("shapes", torch.as_tensor(shapes))
@@ -161,9 +161,7 @@ class DotLocator(nn.Module):
     @property
     def is_compiled(self) -> bool:
         """Whether there is machine code of the fit and the matching's steps already."""
-        return all(
-            each.is_compiled(np.dtype(np.float32)) for each in (kept_fits, kept_trusts, kept_noises, *KEPT_STEPS.values())
-        )
+        return all(each.is_compiled(np.dtype(np.float32)) for each in (kept_fits, *KEPT_STEPS.values()))
 
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the dots in a batch of frames.
@@ -184,8 +182,8 @@ class DotLocator(nn.Module):
         levels = mean_pyramid(short(image) if self.is_exact else image)
         blobs, log_radius, strength = self.detect(levels)
         relative = strength / self.strength[self.match.nearest_dots(blobs)]
-        level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True)
-        valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
+        level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True).clamp_min(LEAST)
+        valid = torch.sigmoid(contrast_evidence(relative / level, FAINT_BLOB))
         level_0, level_1, level_2 = levels
         start = self._alike(blobs, BLOB), self._alike(log_radius, SHARE), self._alike(valid, SHARE)
         return level_0, level_1, level_2, *start
@@ -206,20 +204,18 @@ class DotLocator(nn.Module):
         """The dots, by the fit about where the matcher places the dots."""
         levels, rest, shapes = [level_0, level_1, level_2], self.rest, self.shapes
         gradient = self._alike(self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), SHARE)
-        shape = shapes + gradient.clamp(-0.6, 0.6).to(shapes) @ shapes
+        shape = shapes + gradient.clamp(-LARGEST_STRAIN, LARGEST_STRAIN).to(shapes) @ shapes
         noise = self._alike(pixel_noise(level_0.detach()), NOISE)
-        pixels, covariance, _, quality = self.fit(levels, place, shape, noise, STEPS)
-        seen, quality = pixels.to(rest), quality.to(rest)
-        flow, _, _ = self.match.predict(certainty * quality, seen - rest, strain)
-        predicted = rest + flow
-        deviation = safe_length(seen - predicted, -1) / self.match.nearest
-        confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
-        confidence = confidence * self.coherence(seen, confidence, strain, predicted, blobs, log_radius, valid)
-        odds = 1 + (UNSEEN - 1) * (certainty < KEPT).to(confidence.dtype)
-        confidence = confidence / (confidence + (1 - confidence) * odds)
-        confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
-        confidence = self._alike(confidence, CONFIDENCE)
-        return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, predicted), confidence, covariance)
+        fitted = self.fit(levels, place, shape, noise, STEPS)
+        dots = FittedDots(*(value.to(rest) for value in fitted))
+        by_itself = alone(dots)
+        found, error = self.match.neighbour_steps(dots.centre.mT, by_itself, strain.movedim(1, -1))
+        whole = whole_evidence(self.seams(dots.centre, by_itself, error, blobs, log_radius, valid))
+        share = (by_itself @ self.match.seen.to(by_itself) / self.match.seen.sum())[:, None]
+        confidence = self._alike(among_neighbours(dots, share * found, error, whole), CONFIDENCE)
+        flow, _, _ = self.match.predict(confidence, dots.centre - rest, strain)
+        pixels = torch.where(confidence[..., None] > 0.5, fitted.centre, rest + flow)
+        return LocatedMarkers(pixels, confidence, fitted.covariance)
 
     def _alike(self, value: Tensor, step: float) -> Tensor:
         """The value, or where every runtime is to have the same, its nearest multiple of a step."""

@@ -11,18 +11,18 @@ from ...control_flow import cond, fori_loop, traced, where_rows
 from ..spacing import spacing
 from .agreement import NeighbourAgreement
 from .alignment import Alignment
-from .deformation import FAR, LocalDeformation
+from .deformation import LocalDeformation
 from .flow import SUPPORT, FlowAverages
 from .native_flow import choices, found_by, is_native
-from .steps import NeighbourSteps, trust
+from .probability import LOST, own_evidence
+from .scales import FAR, PREDICTION
+from .steps import NeighbourSteps
 
-ROUNDS = 2  # in which neighbours agree
-SETTLING = 3  # steps after that
-DOUBTS, RESETTLING = 2, 3  # how often the dots that strayed are let go, and the steps in which all settle after it
-FOLLOWING = 1  # steps after dots are followed from where they were
+ROUNDS = 2  # in which neighbours agree, and in which dots that strayed are let go
+SETTLING = 3  # steps after each
 KEPT = 0.3  # certainty of a dot that could be followed
 WIDTH = 1.1  # of the local average, pitches
-TOLERANCE = 0.30  # standard deviation of a prediction, pitches
+NO_DOT = 3.0  # by which the log radius of what is no dot is off
 
 State = tuple[Tensor, Tensor, Tensor]
 """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
@@ -55,7 +55,7 @@ class DotMatcher(nn.Module):
     stiffness: Tensor
     slope: Tensor
     log_radius: Tensor
-    enough: Tensor
+    numbers: Tensor
     seen: Tensor
 
     def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float, seen: np.ndarray):
@@ -66,16 +66,16 @@ class DotMatcher(nn.Module):
         self.agreement = NeighbourAgreement(pixels, seen)
         self.deformation = LocalDeformation(pixels)
         self.averages = FlowAverages(pixels, pixels, WIDTH)
-        self.neighbour_steps = NeighbourSteps(pixels)
+        self.neighbour_steps = NeighbourSteps(pixels, seen)
         self.register_buffer("seen", torch.as_tensor(seen))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
         self.register_buffer("square", self.pixels.square().sum(-1))
         self.register_buffer("nearest", torch.as_tensor(nearest))
-        self.register_buffer("stiffness", torch.as_tensor((TOLERANCE * nearest) ** -2.0))
+        self.register_buffer("stiffness", torch.as_tensor((PREDICTION * nearest) ** -2.0))
         self.register_buffer("slope", -2 * self.stiffness)
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
-        self.register_buffer("enough", torch.tensor([SUPPORT], dtype=torch.float64))
+        self.register_buffer("numbers", torch.tensor([SUPPORT, LOST, FAR], dtype=torch.float64))
 
     def nearest_dots(self, blobs: Tensor) -> Tensor:
         """Which dot at rest is nearest to each of `blobs [B, K, 2]`, `[B, K]`."""
@@ -105,7 +105,7 @@ class DotMatcher(nn.Module):
         """
         if is_native(predicted, support, blobs, base, self.pixels):
             given = predicted, support, blobs, base
-            taken = found_by(choices, (self.pixels, self.stiffness, self.enough), given, 7, len(self.pixels))
+            taken = found_by(choices, (self.pixels, self.stiffness, self.numbers), given, 7, len(self.pixels))
             return taken[:, 0], taken[:, 1:3], taken[:, 3:].unflatten(1, (2, 2))
         expected = self.pixels.mT + predicted
         alone = (expected * expected).sum(1) * self.stiffness + FAR * (support < SUPPORT).to(support.dtype)
@@ -116,7 +116,7 @@ class DotMatcher(nn.Module):
         found, strain, rival = (taken[:, 1:] / taken[:, :1]).split([2, 4, 1], 1)
         mutual = best <= rival[:, 0] + 1e-6 * best.abs()
         weight = torch.exp(-0.5 * best) * mutual * (support / (support + 0.5))
-        flow = torch.where(weight[:, None] > 0.02, found - self.pixels.mT, predicted)
+        flow = torch.where(weight[:, None] > LOST, found - self.pixels.mT, predicted)
         return weight, flow, strain.unflatten(1, (2, 2))
 
     def forward(
@@ -148,7 +148,7 @@ class DotMatcher(nn.Module):
         def doubted() -> Sequence[Tensor]:
             known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
             begun = self.from_sure(weight, flow, strain, known, base)
-            return self.either(complete, weight, flow, strain, *fori_loop(self.doubt, DOUBTS, begun, known, base))
+            return self.either(complete, weight, flow, strain, *fori_loop(self.doubt, ROUNDS, begun, known, base))
 
         return self.end(*cond(complete, (weight, flow, strain), doubted))
 
@@ -207,9 +207,7 @@ class DotMatcher(nn.Module):
         flow, found = self.flow_before(previous)
         weight, flow = found.to(base.dtype), flow.mT
         state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
-        for _ in range(FOLLOWING):
-            state = self.settle(*state, known, base)
-        weight, flow, strain = state
+        weight, flow, strain = self.settle(*state, known, base)
         return weight, flow, strain, ~(found & ~(weight >= KEPT)).any(-1)
 
     @traced
@@ -255,7 +253,7 @@ class DotMatcher(nn.Module):
 
     def misfit(self, log_radius: Tensor, valid: Tensor) -> Tensor:
         """How ill the blobs' sizes fit the dots, squared standard deviations `[B, D, K]`; what is no dot fits none."""
-        return ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
+        return ((self.log_radius[:, None] - (log_radius + NO_DOT * (1 - valid))[:, None]) / self.size_tolerance).square()
 
     @traced
     def grow(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
@@ -271,8 +269,9 @@ class DotMatcher(nn.Module):
     @traced
     def doubt(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """Some steps more after those that took another's blob have been let go."""
-        state = weight * trust(*self.neighbour_steps(self.pixels.mT + flow, weight, strain)), flow, strain
-        for _ in range(RESETTLING):
+        own = own_evidence(*self.neighbour_steps(self.pixels.mT + flow, weight, strain))
+        state = weight * torch.sigmoid(own), flow, strain
+        for _ in range(SETTLING):
             state = self.settle(*state, known, base)
         return state
 

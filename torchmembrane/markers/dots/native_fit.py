@@ -19,8 +19,6 @@ MISFIT = 0.02
 
 STANDS_OUT = 0.35
 """Of a dot's amplitude: what is darker than the fit before by so much counts half outside the dot."""
-EXPLAINED, CONTRAST = (12.0, 0.6), (40.0, 0.12)
-"""Steepness and middle of the quality over the share of the window that is explained, and over the dot's contrast."""
 
 LANES, FIELDS, UNKNOWNS = 16, 8, 7
 """Pixels of a block; fields of a pixel, the last the window itself; unknowns of a fit."""
@@ -53,7 +51,7 @@ class Constants(NamedTuple):
     farthest: Any
     """`[2, 3]`, changes over their reach."""
     numbers: Any
-    """`[3]`: half the window's width, `MISFIT`, the narrowness of sizes."""
+    """`[3]`: half the window's width, `MISFIT`, one over the variance of log radii."""
 
 
 @compiled
@@ -175,8 +173,8 @@ def _fitted(c, d, gram, system):
 
 
 @compiled
-def _told(c, d, gram, system, offset, moved, size, gain, mean, noise, covariance):
-    """The covariance `[2, 2]` of a centre; the quality of the fit."""
+def _told(c, d, gram, system, offset, moved, size, gain, mean, noise, dot, covariance):
+    """The covariance `[2, 2]` of a centre; into `dot [6]` what the window shows, as of `FittedDots`."""
     stride, unit, missed = c.scales[d, 0], c.scales[d, 3], np.float32(0)
     for a in range(FIELDS):
         along = -gram[a, 7]
@@ -185,25 +183,22 @@ def _told(c, d, gram, system, offset, moved, size, gain, mean, noise, covariance
         missed += along * (system[a, 7] if a < UNKNOWNS else -ONE)
     missed = max(missed, np.float32(0))
     spread = gram[7, 7] - gram[0, 7] ** 2 / max(gram[0, 0], ONE)
-    explained = 1 - missed / (max(spread, np.float32(0)) + 1e-6)
+    dot[3] = 1 - missed / (max(spread, np.float32(0)) + 1e-6)
     background = (system[1, 7] * offset[0] + system[2, 7] * offset[1]) / c.scales[d, 2]
-    contrast = -system[3, 7] / max(system[0, 7] - background + mean, 1e-2)
+    dot[4] = -system[3, 7] / max(system[0, 7] - background + mean, 1e-2)
     grown = size + moved[2]
-    misfit = min(np.log(grown / size) ** 2, np.log(grown / c.scales[d, 6]) ** 2)
+    dot[5] = min(np.log(grown / size) ** 2, np.log(grown / c.scales[d, 6]) ** 2) * c.numbers[2]
     variance = (noise / stride) ** 2 + c.numbers[1] * missed / max(gram[0, 0] - 7, 1.0)
     for a in range(2):
         for b in range(2):
             covariance[a, b] = variance * (gain / unit) ** 2 * system[4 + a, 8 + b]
-    of_size = np.exp(misfit * c.numbers[2])
-    of_fit, of_contrast = EXPLAINED[0] * (explained - EXPLAINED[1]), CONTRAST[0] * (contrast - CONTRAST[1])
-    return of_size / (1 + np.exp(-of_fit)) / (1 + np.exp(-of_contrast))
 
 
 def _entry(sources: str) -> Any:
     @kept
     def fits(c, level_0, level_1, level_2, centres, shapes, noise, steps, dots, covariance):
-        """Fit all dots of all frames: arguments as of `EllipseFit.forward`, levels `[B, H, W]`; `dots [B, D, 4]`, the centre,
-        growth and quality, and `covariance [B, D, 2, 2]` are filled."""
+        """Fit all dots of all frames: arguments as of `EllipseFit.forward`, levels `[B, H, W]`; `dots [B, D, 6]`, the centre,
+        growth, share explained, contrast and misfit, and `covariance [B, D, 2, 2]` are filled."""
         pixels, few = c.offsets.shape[1], np.empty((6, 5), np.float32)
         window, fields, each = (
             np.zeros(pixels, np.float32),
@@ -234,10 +229,9 @@ def _entry(sources: str) -> Any:
                     before[4] = gain / np.float32(-STANDS_OUT)
                     for a in range(4):
                         before[a] = system[a, 7] * before[4]
-                quality = _told(c, d, gram, system, offset, moved, size, gain, mean, noise[b], covariance[b, d])
+                _told(c, d, gram, system, offset, moved, size, gain, mean, noise[b], dots[b, d], covariance[b, d])
                 for a in range(3):
                     dots[b, d, a] = moved[a] / unit + (centre[a] if a < 2 else 0)
-                dots[b, d, 3] = quality
 
     return fits
 
@@ -259,17 +253,17 @@ class NativeFit:
 
     def __call__(
         self, fit: Any, levels: list[Tensor], centre: Tensor, shape: Tensor, noise: Tensor, steps: int
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         """What `EllipseFit.forward` gives; arguments as there, in single precision."""
         images = [level[:, 0].contiguous().numpy() for level in levels]
         given = [value.contiguous().numpy() for value in (centre, shape, noise)]
         dots, covariance = (
-            centre.new_empty(*centre.shape[:2], 4),
+            centre.new_empty(*centre.shape[:2], 6),
             torch.empty_like(shape, memory_format=torch.contiguous_format),
         )
         with kept_fits.compiling(np.dtype(np.float32)):
             fits(self._found(fit), *images, *given, steps, dots.numpy(), covariance.numpy())
-        return dots[..., :2], covariance, dots[..., 2], dots[..., 3]
+        return dots[..., :2], covariance, *dots[..., 2:].unbind(-1)
 
     def _found(self, fit: Any) -> Constants:
         if self._constants is None or self._constants[0] is not fit.ridge:

@@ -12,9 +12,6 @@ from torch import Tensor
 
 from ...machine_code import Kept, compiled, fingerprint, kept, takes
 
-FAR = 1e6
-"""Cost of a dot that too few sure ones are around."""
-
 
 @compiled
 def _sums(weight, fields, moments, rows, sums):
@@ -73,12 +70,12 @@ def _along(c, weight, flow, gradient, fields, rows, sums, found):
 
 @compiled
 def _choice(c, predicted, support, blobs, base, least, found):
-    """`DotMatcher.choose` of a frame: `found [7, D]`, the weight, the flow and the strain."""
-    pixels, stiffness, enough = c
+    """`DotMatcher.choose` of a frame: `found [7, D]`, the weight, the flow and the strain; `numbers`: as of `match`."""
+    pixels, stiffness, numbers = c
     cost, rival = np.empty_like(base), np.full(blobs.shape[1], np.inf, base.dtype)
     for d in range(len(pixels)):
         x, y, row, best = pixels[d, 0] + predicted[0, d], pixels[d, 1] + predicted[1, d], cost[d], np.float32(np.inf)
-        alone = (x * x + y * y) * stiffness[d] + (np.float32(FAR) if support[d] < enough[0] else np.float32(0))
+        alone = (x * x + y * y) * stiffness[d] + (numbers[2] if support[d] < numbers[0] else np.float32(0))
         x, y = -2 * stiffness[d] * x, -2 * stiffness[d] * y
         for k in range(len(row)):
             row[k] = alone + x * blobs[1, k] + y * blobs[2, k] + base[d, k]
@@ -97,7 +94,7 @@ def _choice(c, predicted, support, blobs, base, least, found):
         weight = np.exp(-0.5 * best) * (support[d] / (support[d] + 0.5))
         found[0, d] = weight if best <= of_blob / count + 1e-6 * abs(best) else 0.0
         for a in range(2):
-            found[1 + a, d] = found[1 + a, d] - pixels[d, a] if found[0, d] > 0.02 else predicted[a, d]
+            found[1 + a, d] = found[1 + a, d] - pixels[d, a] if found[0, d] > numbers[1] else predicted[a, d]
 
 
 @kept

@@ -5,17 +5,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from ...files.levels import telling_bits
 from ..spacing import neighbours, partly_in_view
 from .blobs import check_count, find_blobs
 from .ellipse import log_radii, rms_half_axes, size_tolerance
-from .fit import EllipseFit
+from .fit import EllipseFit, FittedDots
 from .match import DotMatcher
+from .probability import alone, among_neighbours
 from .pyramid import mean_pyramid
-
-OUTLIER = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
 
 
 class DotPattern(NamedTuple):
@@ -32,14 +30,12 @@ class DotPattern(NamedTuple):
     sizes: np.ndarray
 
 
-def refine(
-    dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: float = 0.45
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres `[D, 2]` fitted to sub-pixel accuracy, the outline's growth `[D]` px, quality `[D]` in 0..1."""
+def refine(dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: float = 0.45) -> FittedDots:
+    """Dots fitted to sub-pixel accuracy, a batch of one."""
     fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance)
     levels = mean_pyramid(torch.as_tensor(dark)[None, None])
-    found = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1, dtype=torch.float32), 8)
-    return found.centre[0].numpy(), found.growth[0].numpy(), found.quality[0].numpy()
+    found: FittedDots = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1), 8)
+    return found
 
 
 def population(pixels: np.ndarray, shapes: np.ndarray, contrasts: np.ndarray) -> np.ndarray:
@@ -101,9 +97,10 @@ def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) 
     keep = population(pixels, shapes, contrasts)
     check_count(int(keep.sum()))
     pixels, shapes, contrasts = pixels[keep], shapes[keep], contrasts[keep]
-    pixels, growth, quality = refine(dark, pixels, shapes)
+    found = refine(dark, pixels, shapes)
+    pixels, growth = found.centre[0].numpy(), found.growth[0].numpy()
     shapes = shapes * (1 + growth / rms_half_axes(shapes))[:, None, None]
-    keep = population(pixels, shapes, contrasts) & (quality > 0.3)
+    keep = population(pixels, shapes, contrasts) & (alone(found)[0].numpy() > 0.5)
     check_count(int(keep.sum()))
     pixels, shapes = pixels[keep], shapes[keep]
     order = np.lexsort((pixels[:, 0], pixels[:, 1]))
@@ -154,10 +151,11 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
     tolerance = size_tolerance(scaled, sizes)
     match = DotMatcher(pixels, expected, tolerance, partly_in_view(pixels, scaled, dark.shape[::-1]))
     blob_radius = torch.as_tensor(log_radius)[None]
-    position, certainty, strain = match(torch.as_tensor(found)[None], blob_radius, torch.ones_like(blob_radius))
-    centre, growth, quality = refine(dark, position[0].numpy(), scaled, tolerance)
-    deviation = _deviation(match, certainty * torch.as_tensor(quality), centre - pixels, strain)
-    visible = (quality > 0.3) & (deviation < OUTLIER * match.nearest.numpy())
+    position, _, strain = match(torch.as_tensor(found)[None], blob_radius, torch.ones_like(blob_radius))
+    refined = refine(dark, position[0].numpy(), scaled, tolerance)
+    centre, growth = refined.centre[0].numpy(), refined.growth[0].numpy()
+    steps = match.neighbour_steps(refined.centre.mT, alone(refined), strain.movedim(1, -1))
+    visible = among_neighbours(refined, *steps)[0].numpy() > 0.5
     check_count(int(visible.sum()))
     for size in np.unique(sizes[visible]):
         scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[visible & (sizes == size)])
@@ -167,9 +165,3 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
 def _dark(image: np.ndarray, polarity: str) -> np.ndarray:
     """The image, or its negative where the dots are light."""
     return np.asarray(image, float) if polarity == "dark" else 1 - np.asarray(image, float)
-
-
-def _deviation(match: DotMatcher, weight: Tensor, flow: np.ndarray, strain: Tensor) -> np.ndarray:
-    """How far `[D]` px the flow `[D, 2]` is from what the dots around each predict."""
-    predicted, _, _ = match.predict(weight, torch.as_tensor(flow)[None], strain)
-    return np.linalg.norm(flow - predicted[0].numpy(), axis=1)

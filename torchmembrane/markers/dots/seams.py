@@ -1,0 +1,62 @@
+"""Seams: where a region of the pattern is matched a whole pitch off."""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..spacing import FADED, faded, spacing, square_distance
+from .scales import PREDICTION
+
+SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
+LEAST = 1e-3
+
+
+class Seams(nn.Module):
+    """How torn the pattern is around every dot.
+
+    A region matched one pitch off ends in a seam, where dots are lost, blobs of their size are left over, and the step
+    from a dot to its neighbour is not what the deformation measured at both makes of it at rest. Lost dots or blobs left
+    over alone, or a field that varies fast, are no seam.
+
+    Args:
+        pixels: centres `[D, 2]` of the dots at rest, px.
+        log_radius: `[D]`, as the blob detector finds it at rest.
+        size_tolerance: standard deviation of a dot's log radius.
+    """
+
+    share: Tensor
+    total: Tensor
+    narrowness: Tensor
+    origin: Tensor
+    claim: Tensor
+    log_radius: Tensor
+
+    def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float):
+        super().__init__()
+        self.size_narrowness = -0.5 / size_tolerance**2
+        nearest, mean = spacing(pixels)
+        kernel = faded(-((pixels[:, None] - pixels) ** 2).sum(-1) / (2 * (SEAM * mean) ** 2))  # [from, to]
+        self.register_buffer("share", torch.as_tensor(kernel / kernel.sum(0)))
+        self.register_buffer("total", torch.as_tensor(kernel.sum(0)))
+        self.register_buffer("narrowness", torch.as_tensor(-0.5 / (SEAM * mean) ** 2))
+        self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
+        self.register_buffer("claim", torch.as_tensor((PREDICTION * nearest) ** 2))
+        self.register_buffer("log_radius", torch.as_tensor(log_radius))
+
+    def forward(self, pixels: Tensor, sure: Tensor, wrong: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> Tensor:
+        """Root of the share of dots lost and blobs left over, times the relative error of steps, `[B, D]`.
+
+        Args:
+            pixels: of the dots as found `[B, D, 2]`, px.
+            sure: how surely, `[B, D]` in 0..1.
+            wrong: relative error of the steps to their neighbours `[B, D]`.
+            blobs: `[B, K, 2]`, px; log_radius, valid: `[B, K]`, as for `DotMatcher`.
+        """
+        square = square_distance(blobs - self.origin, pixels - self.origin)  # [B, K, D]
+        claimed = ((square < self.claim) * sure[:, None]).amax(-1)
+        misfit = log_radius - self.log_radius[square.argmin(-1)]
+        left = valid * torch.exp(misfit.square() * self.size_narrowness) * (1 - claimed)
+        left = (left[:, None] @ torch.exp((square * self.narrowness).clamp_min(-FADED))).squeeze(1) / self.total
+        lost = (1 - sure) @ self.share
+        around = ((sure * wrong) @ self.share) / (sure @ self.share).clamp_min(LEAST)
+        return torch.minimum(lost, left).clamp_min(LEAST**4).sqrt() * around
