@@ -1,4 +1,4 @@
-"""Evidence is the logarithm of ratios of densities; the probability is Bayes' rule over the explanations."""
+"""A dot is found where this is likelier than all other explanations."""
 
 import numpy as np
 import pytest

@@ -10,7 +10,7 @@ from .scales import FAR, NONE
 
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
 NEIGHBOURS = 8  # that are mapped
-BESIDE = 12  # blobs on which they are laid
+TARGETS = 12  # blobs on which they are laid
 AVERAGE = 0.8  # pitches, over which a deformation is averaged
 RIDGE = 0.2  # draws a fit to the one before
 
@@ -77,7 +77,7 @@ class LocalDeformation(nn.Module):
         own = square_distance(blobs - middle, self.pixels - middle).argmin(-1)
         around, pitch = self.around[own], self.pitch[own]
         apart = square_distance(blobs - middle, blobs - middle)
-        index = (apart + FAR * (1 - valid[:, None])).topk(min(1 + BESIDE, blobs.shape[1]), largest=False).indices[..., 1:]
+        index = (apart + FAR * (1 - valid[:, None])).topk(min(1 + TARGETS, blobs.shape[1]), largest=False).indices[..., 1:]
         known = torch.cat([blobs.mT, valid[:, None]], 1).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1))
         position, there = known.unflatten(2, index.shape[1:]).split([2, 1], 1)
         others = (position - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, 12]
