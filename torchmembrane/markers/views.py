@@ -47,7 +47,7 @@ class ViewsObserver(nn.Module):
         super().__init__()
         self.each, self.names, self.regions = nn.ModuleList(observers), list(names), regions
         self.count, self.views = len(observers[0].rest_pixels), len(observers)
-        principal = torch.stack([camera.centre.double() for camera in rig.cameras])  # type: ignore[misc, operator]
+        principal = torch.stack([camera.centre.double() for camera in rig.cameras])  # type: ignore[misc]
         self.register_buffer("principal", principal.repeat_interleave(self.count, 0))
         self.rig = rig
 
