@@ -5,6 +5,7 @@ import glob
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from filecmp import cmp
 from pathlib import Path
 from typing import NamedTuple
 
@@ -147,14 +148,9 @@ def without_rest(inputs: Inputs, arguments: Iterable[str | Path], files: Iterabl
     """
     folders = [Path(argument) for argument in arguments if Path(argument).is_dir()]
     known = [path for path in files if path.suffix.lower() in IMAGES and path.is_file()]
-    rest = [path for path in inputs.images if path.parent in folders and any(_is_copy(path, image) for image in known)]
+    rest = [path for path in inputs.images if path.parent in folders and any(cmp(path, image, shallow=False) for image in known)]
     images = [path for path in inputs.images if path not in rest]
     return inputs._replace(images=images, rest=rest) if images or inputs.videos else inputs
-
-
-def _is_copy(path: Path, other: Path) -> bool:
-    """Whether two files are the same to the byte."""
-    return path.stat().st_size == other.stat().st_size and path.read_bytes() == other.read_bytes()
 
 
 def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = ()) -> Inputs:
