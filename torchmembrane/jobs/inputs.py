@@ -148,7 +148,8 @@ def without_rest(inputs: Inputs, arguments: Iterable[str | Path], files: Iterabl
     """
     folders = [Path(argument) for argument in arguments if Path(argument).is_dir()]
     known = [path for path in files if path.suffix.lower() in IMAGES and path.is_file()]
-    rest = [path for path in inputs.images if path.parent in folders and any(cmp(path, image, shallow=False) for image in known)]
+    beside = [path for path in inputs.images if path.parent in folders]
+    rest = [path for path in beside if any(cmp(path, image, shallow=False) for image in known)]
     images = [path for path in inputs.images if path not in rest]
     return inputs._replace(images=images, rest=rest) if images or inputs.videos else inputs
 
