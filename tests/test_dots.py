@@ -689,3 +689,17 @@ def test_dots_beyond_the_border_of_the_image_do_not_move_those_in_it():
     pixels, confidence, _ = locate(image)
     assert np.linalg.norm(pixels[0].numpy() - moved, axis=1)[seen].max() < 0.3 and confidence[0, seen].min() > 0.5
     assert seen.sum() < 0.6 * len(rest)
+
+
+@pytest.mark.parametrize("beyond", [4.0, 6.0])
+def test_a_dot_whose_middle_leaves_the_image_is_lost_though_its_edge_is_seen(beyond):
+    """Large dots; all move to the left until the first column is so many pixels beyond the border."""
+    spacing, radius = 30.0, 10.5
+    rest = np.stack(np.meshgrid(np.arange(7), np.arange(5)), -1).reshape(-1, 2) * spacing + [spacing / 2, 35.0]
+    shapes = np.tile(radius * np.eye(2), (len(rest), 1, 1))
+    moved = rest - [spacing / 2 + beyond, 0.0]
+    locate = DotLocator(DotPattern(rest, shapes, np.ones(len(rest), int)), SIZE, "dark")
+    pixels, confidence, _ = locate(draw_dots(moved, shapes, SIZE).float())
+    gone = moved[:, 0] < 0
+    assert gone.sum() == 5 and (confidence[0, gone] < 0.5).all() and (confidence[0, ~gone] > 0.5).all()
+    assert np.linalg.norm(pixels[0].numpy() - moved, axis=1)[~gone].max() < 0.3

@@ -63,6 +63,19 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     return torch.as_tensor(inside, dtype=torch.float64)[None, None]
 
 
+def is_inside(pixels: Tensor, image: Tensor) -> Tensor:
+    """Which of `pixels [..., 2]` lie in an image `[..., height, width]`, bool.
+
+    A dot that its neighbours expect outside is not seen; what a fit finds at the border in its place is something else.
+
+    Example:
+        >>> is_inside(torch.tensor([[0.0, 0.0], [3.0, 1.0], [3.0, 2.0], [-1.0, 0.0]]), torch.zeros(2, 4)).tolist()
+        [True, True, False, False]
+    """
+    size = torch.tensor([image.shape[-1], image.shape[-2]], dtype=pixels.dtype, device=pixels.device)
+    return ((pixels > -0.5) & (pixels < size - 0.5)).all(-1)
+
+
 def short(image: Tensor) -> Tensor:
     """An image in 0..1 with so few digits that float32 holds its means over 4 x 4 pixels: these are alike in whatever order.
 
@@ -214,6 +227,7 @@ class DotLocator(nn.Module):
         share = (by_itself @ self.match.seen.to(by_itself) / self.match.seen.sum())[:, None]
         confidence = self._alike(among_neighbours(dots, share * found, error, whole), CONFIDENCE)
         flow, _, _ = self.match.predict(confidence, dots.centre - rest, strain)
+        confidence = confidence * is_inside(rest + flow, level_0).to(confidence)
         pixels = torch.where(confidence[..., None] > 0.5, fitted.centre, rest + flow)
         return LocatedMarkers(pixels, confidence, fitted.covariance)
 
