@@ -72,8 +72,8 @@ def is_inside(pixels: Tensor, image: Tensor) -> Tensor:
         >>> is_inside(torch.tensor([[0.0, 0.0], [3.0, 1.0], [3.0, 2.0], [-1.0, 0.0]]), torch.zeros(2, 4)).tolist()
         [True, True, False, False]
     """
-    size = torch.tensor([image.shape[-1], image.shape[-2]], dtype=pixels.dtype, device=pixels.device)
-    return ((pixels > -0.5) & (pixels < size - 0.5)).all(-1)
+    (u, v), (height, width) = pixels.unbind(-1), image.shape[-2:]
+    return (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
 
 
 def short(image: Tensor) -> Tensor:
