@@ -133,13 +133,13 @@ def joined(
     off, is_bent = rows @ x - values, any(one.sides for one in evidence)
     about = x[0], covariance[0, 0] ** 0.5
     if is_bent:
-        x, covariance, off = _summed(evidence, rows, values, about, least)[:3]
+        x, covariance, off = _summed(evidence, rows, values, about, least)
     at, said = x[1] - s * off[2:], []
     scatter = max(1.0, (off**2).sum() / max(len(s) - 1, 1))
     covariance = scatter * covariance
     intervals = x[:2, None] + normal_interval(covariance.diagonal()[:2, None] ** 0.5)
     if is_bent:
-        intervals = _summed(evidence, rows, values, about, least, scatter)[3]
+        intervals = _bent_intervals(evidence, rows, values, about, least, scatter)
     for i, one in enumerate(evidence):
         for k in range(i + 1, len(evidence)):
             apart = abs(at[i] - at[k]) / np.hypot(s[i], s[k])
@@ -167,43 +167,63 @@ def normal_interval(deviation: ArrayLike) -> np.ndarray:
 
 
 def _summed(
+    evidence: Sequence[ModulusEvidence], rows: np.ndarray, values: np.ndarray, about: tuple[float, float], least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean and covariance of shift, log modulus and height, and what is missed at the mean shift, rows as of `joined`, where
+    logarithms of moduli are parabolas: of each shift the best modulus and height, by least squares, with its probability."""
+    t = _shifts(*about, least)
+    best, off, covariance = _best(evidence, rows, values, t)
+    weight, x = _probabilities(off), np.column_stack([t, best])
+    mean = weight @ x
+    spread = (weight[:, None] * (x - mean)).T @ (x - mean)
+    spread[1:, 1:] += covariance
+    return mean, spread, _best(evidence, rows, values, mean[:1])[1][0]
+
+
+def _bent_intervals(
     evidence: Sequence[ModulusEvidence],
     rows: np.ndarray,
     values: np.ndarray,
     about: tuple[float, float],
     least: float,
-    scatter: float = 1.0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and covariance of shift, log modulus and height, what is missed at the mean shift, and intervals of shift and log
-    modulus `[2, 2]`, rows as of `joined`, where logarithms of moduli are parabolas: of each shift the best modulus and height,
-    by least squares, with its probability; `scatter`: by how much all variances are larger."""
-    t = about[0] + about[1] * scatter**0.5 * np.linspace(-REACH, REACH, SHIFTS)
-    t = t[t >= least] if (t >= least).any() else np.array([least, least + 1e-9])
+    scatter: float,
+) -> np.ndarray:
+    """Intervals of the shift and of the log modulus, `[2, 2]`, where logarithms of moduli are parabolas and all variances are
+    `scatter` times as large."""
+    t = _shifts(about[0], about[1] * scatter**0.5, least)
+    best, off, covariance = _best(evidence, rows, values, t)
+    weight, width = _probabilities(off, scatter), (scatter * covariance[0, 0]) ** 0.5
+    return np.stack([_interval(weight, t, t[1] - t[0]), _interval(weight, best[:, 0], width)])
 
-    def wanted_at(t: np.ndarray) -> np.ndarray:
-        """What modulus and height are to fulfil at these shifts, `[n, R]`."""
-        wanted = values - t[:, None] * rows[:, 0]
-        for i, one in enumerate(evidence):
-            if one.sides:
-                low, high = np.log(np.array(one.sides) / one.modulus)
-                parabola = np.log(one.modulus) + (high - low) / 2 * t + (high + low) / 2 * t**2
-                wanted[:, 2 + i] = parabola * one.modulus / one.deviation
-        return wanted
 
+def _shifts(middle: float, deviation: float, least: float) -> np.ndarray:
+    """Shifts over which probabilities are summed, `[n]`."""
+    t = middle + deviation * np.linspace(-REACH, REACH, SHIFTS)
+    return t[t >= least] if (t >= least).any() else np.array([least, least + 1e-9])
+
+
+def _best(
+    evidence: Sequence[ModulusEvidence], rows: np.ndarray, values: np.ndarray, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Log modulus and height that fulfil the rows best at shifts `t [n]`, `[n, 2]`, what they miss, `[n, R]`, and their
+    covariance `[2, 2]` at a shift."""
+    wanted = values - t[:, None] * rows[:, 0]
+    for i, one in enumerate(evidence):
+        if one.sides:
+            low, high = np.log(np.array(one.sides) / one.modulus)
+            parabola = np.log(one.modulus) + (high - low) / 2 * t + (high + low) / 2 * t**2
+            wanted[:, 2 + i] = parabola * one.modulus / one.deviation
     others = rows[:, 1:]
     covariance = np.linalg.inv(others.T @ others)
     solved = others @ covariance
-    best, off = (wanted := wanted_at(t)) @ solved, wanted @ (solved @ others.T) - wanted
+    return wanted @ solved, wanted @ (solved @ others.T) - wanted, covariance
+
+
+def _probabilities(off: np.ndarray, scatter: float = 1.0) -> np.ndarray:
+    """Of what misses `off [n, R]`, each of variance `scatter`, `[n]`; their sum is 1."""
     loss = (off**2).sum(1) / (2 * scatter)
-    weight = np.exp(loss.min() - loss)
-    weight /= weight.sum()
-    x = np.column_stack([t, best])
-    mean = weight @ x
-    spread = (weight[:, None] * (x - mean)).T @ (x - mean)
-    spread[1:, 1:] += scatter * covariance
-    at_mean, width = wanted_at(mean[:1])[0], (scatter * covariance[0, 0]) ** 0.5
-    intervals = np.stack([_interval(weight, t, t[1] - t[0]), _interval(weight, best[:, 0], width)])
-    return mean, spread, at_mean @ (solved @ others.T) - at_mean, intervals
+    weight: np.ndarray = np.exp(loss.min() - loss)
+    return weight / weight.sum()
 
 
 def _interval(weight: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:

@@ -14,7 +14,7 @@ VOTE = 0.25  # pitches, width of a vote and distance of the shifts
 HOME = 4.0  # pitches: of two shifts with alike many votes the smaller is taken
 FITS, WIDTH = 5, 0.4  # of the affine map, and pitches in which it looks for blobs
 STIFFNESS = 0.05  # of the affine map, per dot
-FAR = 1e3  # square pitches, by which a blob of another size is farther
+OTHER_SIZE = 1e3  # square pitches, by which a blob of another size is farther
 
 
 class Alignment(nn.Module):
@@ -72,7 +72,7 @@ class Alignment(nn.Module):
     def shifted(self, place: Tensor, blobs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """`place [B, D, 2]` after the shift with the most votes, and these `[B]`."""
         square = square_distance(place, blobs)
-        index = (square + FAR * self.unit**2 * (1 - weight)).topk(min(CANDIDATES, blobs.shape[1]), largest=False).indices
+        index = (square + OTHER_SIZE * self.unit**2 * (1 - weight)).topk(min(CANDIDATES, blobs.shape[1]), largest=False).indices
         there = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         offset = ((there - place[:, :, None]) / self.unit).flatten(1, 2)
         along_u, along_v = torch.exp(-((offset[..., None] - self.shifts) / VOTE).square() / 2).unbind(2)
