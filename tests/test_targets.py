@@ -23,7 +23,7 @@ from torchmembrane.files.atomic import make_folder, make_subfolder, whole_file, 
 from torchmembrane.files.images import write_as_taken, write_image
 from torchmembrane.files.targets import refuse_overwriting
 from torchmembrane.interruption import remove_unfinished, unfinished
-from torchmembrane.plot.drawing import save
+from torchmembrane.plot.files import save
 from torchmembrane.plot.film import write_film
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.results.frame_shapes import SHAPES, shape_of

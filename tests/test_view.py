@@ -15,7 +15,7 @@ from PIL import Image
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli.film import FrameImages
 from torchmembrane.plot import frames as view
-from torchmembrane.plot.drawing import save
+from torchmembrane.plot.files import save
 from torchmembrane.plot.sensor import sensor_figure
 from torchmembrane.results.status import Status
 from torchmembrane.results.store import Mesh

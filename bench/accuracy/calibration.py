@@ -41,7 +41,7 @@ from torchmembrane.calibrate.surface import fine_surface, surface_projection
 from torchmembrane.files.images import to_grey
 from torchmembrane.markers.dots.pattern import find_dots
 from torchmembrane.plot.calibration import fit_figure, layout_figure, surface_figure
-from torchmembrane.plot.drawing import save
+from torchmembrane.plot.files import save
 from torchmembrane.simulate import Appearance, Plane, Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.target_renderer import TargetRenderer

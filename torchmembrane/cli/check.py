@@ -96,7 +96,7 @@ def run(arguments: Namespace) -> int:
     if sheet and sheet.range and not str(arguments.sensor).startswith(PREFIX):
         _keep(sheet.range, range_file(sensor_file(arguments.sensor)))
     if arguments.out:
-        from ..plot.drawing import save
+        from ..plot.files import save
         from ..plot.sensor import sensor_figure
 
         save(sensor_figure(sensor, reconstructor, frame, sheet), arguments.out, "check")
@@ -138,7 +138,7 @@ def _spare_files(arguments: Namespace, sensor: Path) -> None:
     from functools import partial
 
     from ..files.targets import refuse_overwriting
-    from ..plot.drawing import drawn_by
+    from ..plot.files import drawn_by
     from ..sensor.companions import files_of
 
     refuse_overwriting("check --out", [arguments.out], files_of(sensor), arguments.force, partial(drawn_by, "check"))

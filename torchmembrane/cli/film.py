@@ -64,7 +64,7 @@ def draw_film(results: "Results", images: FrameImages, path: Path, rate: float =
 def draw_sheet(results: "Results", images: FrameImages, path: Path) -> None:
     """Draw all frames, or `MOST_FRAMES` of them, small on one sheet, and say so."""
     from ..files.order import evenly
-    from ..plot.drawing import save
+    from ..plot.files import save
     from ..plot.sheet import sheet_figure
 
     names = evenly(results.names, MOST_FRAMES)

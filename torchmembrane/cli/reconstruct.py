@@ -182,7 +182,6 @@ def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "
 def _check(arguments: Namespace) -> None:
     """Refuse options that cannot be together, or not on this machine, before anything is read."""
     from ..errors import MembraneError
-    from ..plot.film import check_film
 
     if arguments.engine == "local":
         check_device(arguments.device)
@@ -191,6 +190,8 @@ def _check(arguments: Namespace) -> None:
     if arguments.engine == "ray" and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:
+        from ..plot.film import check_film
+
         check_film(arguments.video_out)
 
 
@@ -201,7 +202,7 @@ def _spare_files(arguments: Namespace, inputs: "Inputs") -> None:
     from ..files.targets import refuse_overwriting
     from ..jobs.result_folder import files_at_risk
     from ..jobs.workers import DRAWS
-    from ..plot.drawing import drawn_by
+    from ..plot.files import drawn_by
     from ..presets import sensor_file
     from ..sensor.companions import files_of
 

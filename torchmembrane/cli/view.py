@@ -100,7 +100,7 @@ def _spare_files(arguments: Namespace, folders: list[Path], *targets: Path | Non
     from functools import partial
 
     from ..files.targets import refuse_overwriting
-    from ..plot.drawing import drawn_by
+    from ..plot.files import drawn_by
 
     patterns = "*.npz", "frames/*.parquet", "*.csv"
     read = [path for folder in folders for pattern in patterns for path in folder.glob(pattern)]
@@ -112,7 +112,7 @@ def _spare_files(arguments: Namespace, folders: list[Path], *targets: Path | Non
 
 def _plot(folders: list[Path], path: Path) -> None:
     """Draw the tables of folders over time, and say so."""
-    from ..plot.drawing import save
+    from ..plot.files import save
     from ..plot.series import series_figure
     from ..results.summary import read_summary
 
@@ -136,7 +136,8 @@ def _show(results: "Results", images: FrameImages, times: dict[str, float], save
 
 def _draw(arguments: Namespace) -> int:
     from ..files.images import read_image
-    from ..plot.drawing import save, show
+    from ..plot.drawing import show
+    from ..plot.files import save
     from ..plot.frames import figure
     from ..results.point_cloud import save_contact_cloud
     from ..results.read import read_frame

@@ -4,9 +4,10 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import IO, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
-from PIL.TiffImagePlugin import ImageFileDirectory_v2
+if TYPE_CHECKING:
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 WIDTH, HEIGHT, BITS, COMPRESSION, COLOURS, FILL_ORDER, ROWS, PLANES = 256, 257, 258, 259, 262, 266, 278, 284
 PLACES, LENGTHS, TILE = (273, 324), (279, 325), (322, 323)
@@ -29,7 +30,7 @@ class _Entry(NamedTuple):
     end: int
 
 
-def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
+def refuse_damaged_page(tags: "ImageFileDirectory_v2", file: IO[bytes]) -> None:
     """Refuse a page whose compressed data have a wrong checksum or go on after its last pixel, where decoders stop.
 
     Args:
@@ -56,7 +57,7 @@ def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
             raise ValueError(f"damaged data of a TIFF: {error}") from error
 
 
-def refuse_displaced(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
+def refuse_displaced(tags: "ImageFileDirectory_v2", file: IO[bytes]) -> None:
     """Refuse an uncompressed file of one page with extra bytes at its end: bytes may have been inserted before them.
 
     Equal bytes are taken for padding.
@@ -84,13 +85,13 @@ def refuse_displaced(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
         )
 
 
-def _data(tags: ImageFileDirectory_v2) -> list[tuple[int, int]]:
+def _data(tags: "ImageFileDirectory_v2") -> list[tuple[int, int]]:
     """Offset and length of each strip or tile; an empty list if the file does not state the lengths."""
     places, lengths = (next((tags[tag] for tag in pair if tag in tags), ()) for pair in (PLACES, LENGTHS))
     return list(zip(places, lengths, strict=False))
 
 
-def _sizes(tags: ImageFileDirectory_v2, number: int) -> tuple[int, ...]:
+def _sizes(tags: "ImageFileDirectory_v2", number: int) -> tuple[int, ...]:
     """The number of bytes to which a strip or a tile may unpack; the last strip may be as long as the others."""
     bits = tags.get(BITS, (1,))[: 1 if tags.get(PLANES) == APART else None]
     if TILE[0] in tags:

@@ -9,7 +9,7 @@ import numpy as np
 from ..accuracy.contact_law import DEPTH, RADIUS, ContactLaw
 from ..files.atomic import make_folder, write_text
 from ..plot.contact_law import contact_figure
-from ..plot.drawing import save
+from ..plot.files import save
 from ..pose import Pose
 from ..sensor.sensor import Sensor
 from ..sensor.table import toml_lines

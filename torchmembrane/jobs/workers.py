@@ -64,7 +64,7 @@ class Work(NamedTuple):
         with using(self.machine_code), frame_in_work():
             found = self.reconstructor.outcomes(group)
         if self.figures:
-            from ..plot.drawing import save
+            from ..plot.files import save
             from ..plot.frames import figure
 
             folder, mesh = self.figures

@@ -1,9 +1,7 @@
-"""Common parts of figures: colours, rows of panels, axes in pixels and in lengths, grids as lines; writing and showing.
+"""Common parts of figures: colours, rows of panels, axes in pixels and in lengths, grids as lines; showing.
 
 A figure here is a matplotlib `Figure` that belongs to no window, so that drawing needs no display.
 """
-
-from pathlib import Path
 
 import numpy as np
 from matplotlib import rc_context
@@ -11,10 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
-from PIL import Image
 
-from ..files.atomic import make_folder, whole_file
-from ..files.safe_read import DAMAGE
 from ..surface.topology import rim_loop
 
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any colour vision
@@ -27,49 +22,6 @@ ABOVE, UNDER = 0.9, 1.3  # of it: the headline and titles of two lines; labels a
 TITLE = 0.6  # inches, of the titles of a further row
 SHORT = (-2, 3)  # powers of ten of lengths whose ticks are written in full: a membrane in um or m has its power beside the axis
 LINES = 16  # of a grid that are drawn each way, at most about
-
-
-def save(drawing: Figure, path: str | Path, command: str = "") -> None:
-    """Write a figure as PNG, whole or not at all.
-
-    Args:
-        drawing: the figure.
-        path: the file; its folder is made if need be.
-        command: that draws it; the file says so, and `drawn_by` reads it.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     save(Figure(), Path(folder) / "empty.png")
-        ...     [path.name for path in Path(folder).iterdir()]
-        ['empty.png']
-    """
-    path = Path(path)
-    make_folder(path.parent)
-    with whole_file(path) as partial:
-        drawing.savefig(partial, format="png", metadata={"Software": _software(command)})
-
-
-def drawn_by(command: str, path: Path) -> bool:
-    """Whether a file is a figure that a command of torchmembrane drew, which may draw it anew.
-
-    Args:
-        command: as for `save` was told.
-        path: any file.
-
-    Example:
-        >>> drawn_by("check", Path("examples/rest.png"))
-        False
-    """
-    try:
-        with Image.open(path, formats=["PNG"]) as image:
-            return image.info.get("Software") == _software(command)
-    except DAMAGE:
-        return False
-
-
-def _software(command: str) -> str:
-    return f"torchmembrane {command}".rstrip()
 
 
 def show(drawing: Figure) -> None:

@@ -1,7 +1,9 @@
-"""Resampling of a grid of vertices to other numbers of lines, equally spaced along the surface."""
+"""Resampling of a grid of vertices to other numbers of lines, equally spaced along the surface.
+
+scipy.interpolate, which takes 0.2 s to import, is loaded only where a grid is resampled.
+"""
 
 import numpy as np
-from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from ..errors import MembraneError
 
@@ -51,6 +53,8 @@ def on_lines(X: np.ndarray, lines: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         >>> on_lines(X, (np.array([1.5]), np.array([0.0, 2.25]))).round(6).tolist()
         [[[1.5, 0.0, 0.0], [1.5, 2.25, 0.0]]]
     """
+    from scipy.interpolate import RectBivariateSpline
+
     m, n = (np.arange(count) for count in X.shape[:2])
     return np.stack([RectBivariateSpline(m, n, X[..., c])(*lines) for c in range(3)], -1)
 
@@ -70,6 +74,8 @@ def even_lines(X: np.ndarray, count: int) -> np.ndarray:
         >>> even_lines(X, 4).round(1).tolist()
         [0.0, 2.0, 3.0, 4.0]
     """
+    from scipy.interpolate import CubicSpline
+
     fine = np.linspace(0, len(X) - 1, FINE * (len(X) - 1) + 1)
     step = np.diff(CubicSpline(np.arange(len(X)), X)(fine), axis=0)
     length = np.concatenate([[0.0], np.cumsum(((step**2).sum(-1).mean(1)) ** 0.5)])
