@@ -173,7 +173,7 @@ OTHERS_FILES = {
     "results/summary.py": "line by line, as long as it likes, of a regular file",
     "files/provenance.py": "hashed piece by piece, of a regular file",
     "sensor/table.py": "tomllib, of text",
-    "plot/drawing.py": "Image.open, of a PNG's text alone",
+    "plot/files.py": "Image.open, of a PNG's text alone",
     "cli/calibrate/files.py": "np.loadtxt, of text",
     "simulate/frames.py": "JSON, of text, and of a table's metadata",
     "accuracy/finished.py": "JSON, of text",

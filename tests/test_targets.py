@@ -473,7 +473,7 @@ def test_a_full_standard_output_is_named(monkeypatch, capsys):
 WRITES = {"savefig", "write_table", "mkdir", "touch", "savetxt"}
 WITHIN = {
     "files/atomic.py": "the one place",
-    "plot/drawing.py": "within whole_file",
+    "plot/files.py": "within whole_file",
     "plot/film.py": "within whole_file",
     "results/data_set.py": "a folder of its own, renamed when it is whole",
     "results/frame_table.py": "within whole_file",

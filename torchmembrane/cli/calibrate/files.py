@@ -22,7 +22,7 @@ from ...files.safe_read import read_array
 from ...files.targets import refuse_overwriting
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
 from ...jobs.pressure import by_frame, refusal
-from ...plot.drawing import save
+from ...plot.files import save
 from ...presets import sensor_file
 from ...sensor.companions import companions_of, files_of
 from ...sensor.record import Record

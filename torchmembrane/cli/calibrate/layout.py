@@ -6,7 +6,7 @@ from dataclasses import replace
 from ...calibrate.layout import layout_for_pixels, pixel_lattice, read_pixels, write_layout, write_svg
 from ...errors import MembraneError
 from ...plot.calibration import layout_figure
-from ...plot.drawing import save
+from ...plot.files import save
 from ...presets import sensor_file
 from ...sensor.parts import Markers
 from ...sensor.sensor import Sensor
