@@ -144,6 +144,22 @@ def fingerprint(*files: str | None) -> str:
     return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
 
 
+def row_major(constants: Any) -> Any:
+    """Constants of a `kept` function, an array or (named) tuples of them, with every array in row-major order, contiguous: a
+    function is compiled again for each layout of each array.
+
+    Example:
+        >>> row_major((np.zeros((3, 4))[:, :2], 1.0))[0].flags.c_contiguous
+        True
+    """
+    if isinstance(constants, np.ndarray):
+        return np.ascontiguousarray(constants)
+    if not isinstance(constants, tuple):
+        return constants
+    each = map(row_major, constants)
+    return type(constants)(*each) if hasattr(constants, "_fields") else tuple(each)
+
+
 def aligned(size: int, dtype: np.dtype) -> np.ndarray:
     """An array of zeros whose address is a multiple of 64 bytes.
 

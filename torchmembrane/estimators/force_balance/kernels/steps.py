@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ....machine_code import Kept, fingerprint, kept
+from ....machine_code import Kept, fingerprint, kept, row_major
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
 from ....mechanics.native_membrane import Surface, surface_of
@@ -91,7 +91,7 @@ class NativeSteps:
         constants, fixed = self._prepared(equations, cavity, measured)
         u, pressure, moved, earlier = (value.contiguous().numpy() for value in (*state, before))
         weights, given = np.empty((len(u), 0), u.dtype), np.array([[equations.loss.cone, far, 0, 0, 0]], float)
-        found = state[0].new_empty(len(u), TOLD), torch.empty_like(state[0]), torch.empty_like(state[0][..., 0])
+        found = tuple(state[0].new_empty(shape) for shape in ((len(u), TOLD), state[0].shape, state[0].shape[:-1]))
         told, traction, reference = (value.numpy() for value in found)
         grid = equations.forces.membrane.grid
         u, earlier, traction = (value.reshape(-1, *grid, 3) for value in (u, earlier, traction))
@@ -153,14 +153,14 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         is_gas=cavity.filling == "gas",
         absolute=absolute,
         gas_volume=gas,
-        **{name: getattr(settings, name) for name in Numbers._fields if hasattr(settings, name)},
+        **{name: float(getattr(settings, name)) for name in Numbers._fields if hasattr(settings, name)},
     )
 
     def array(values: Tensor) -> np.ndarray:
         return np.ascontiguousarray(values.numpy(), dtype)
 
     surroundings, wider = array(loss.surroundings), array(loss.wider)
-    return Constants(
+    constants = Constants(
         surface,
         array(loss.area),
         surroundings,
@@ -175,6 +175,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         bearings.nearest.numpy(),
         numbers,
     )
+    return row_major(constants)
 
 
 def _nothing(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
