@@ -12,7 +12,7 @@ from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-FEW = ForceBalanceSettings(steps=2, retry_steps_factor=2, retry_acceptance_ratio=1e9)
+FEW = ForceBalanceSettings(steps=2, settling_steps=1, retry_steps_factor=2, retry_acceptance_ratio=1e9)
 """Steps take long to compile; after so few the first try has not settled, and the second is taken, whatever its objective."""
 
 
