@@ -69,8 +69,9 @@ $(VENV)/.coverage: $(READY)
 	touch $@
 
 checked: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/compile.py & compiling=$$!; $(MAKE) --no-print-directory lint; found=$$?; \
-		wait $$compiling && exit $$found
+	export OMP_NUM_THREADS=1; $(BIN)/python tests/compile.py float32 & single=$$!; \
+		$(BIN)/python tests/compile.py float64 & double=$$!; \
+		$(MAKE) --no-print-directory lint; found=$$?; wait $$single && wait $$double && exit $$found
 
 test-lowest: $(LOWEST)/.ready
 	$(LOWEST)/bin/python tests/lowest.py

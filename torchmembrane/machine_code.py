@@ -22,8 +22,8 @@ from torch import Tensor
 
 from .interruption import unstoppable
 
-SECONDS = 30
-"""Compiling for one precision takes about this long: a frame of `examples/`, no cache yet, a core with AVX-512."""
+SECONDS = 45
+"""Compiling the steps for one precision takes about this long: 30 s on a core with AVX-512, 62 s on an AMD EPYC with AVX2."""
 
 _used = ContextVar("machine code is used", default=True)
 
