@@ -38,15 +38,15 @@ def test_a_dot_and_none_are_alike_where_schwarz_finds_them_equal():
 
 def test_contrasts_are_told_apart_as_two_normal_distributions():
     contrast = np.linspace(-0.5, 1.5, 9)
-    right, wrong = (stats.norm(0.4 + side, p.CONTRAST_DEVIATION).logpdf(contrast) for side in (0.5, -0.5))
-    np.testing.assert_allclose(p.contrast_evidence(torch.tensor(contrast), 0.4), right - wrong, atol=1e-9)
+    right, wrong = (stats.norm(p.FAINT + side, p.CONTRAST_DEVIATION).logpdf(contrast) for side in (0.5, -0.5))
+    np.testing.assert_allclose(p.contrast_evidence(torch.tensor(contrast)), right - wrong, atol=1e-9)
 
 
 def test_right_steps_are_normal_and_wrong_ones_uniform_in_the_plane():
     error, found = np.linspace(0, 0.5, 6), np.linspace(0, 1, 6)
     right = stats.multivariate_normal(np.zeros(2), p.STEP_DEVIATION**2).logpdf(np.stack([error, 0 * error], -1))
     prior = np.log((found + p.LOST) / (1 - found + p.LOST))
-    expected = prior + right + np.log(np.pi * p.WRONG_STEP**2)
+    expected = prior + right + np.log(np.pi * p.PREDICTION**2)
     np.testing.assert_allclose(p.own_evidence(torch.tensor(found), torch.tensor(error)), expected, atol=1e-9)
 
 
@@ -88,7 +88,7 @@ def test_the_frame_is_judged_alone_as_in_a_batch():
 
 def test_a_tear_is_told_as_an_exponential_distribution_from_a_uniform_one():
     tear = np.array([0.0, 0.01, 0.1])
-    expected = stats.expon(scale=p.TEAR).logpdf(tear) - stats.expon(scale=p.TEAR).logpdf(0.0) + p.TORN
+    expected = stats.expon(scale=p.TEAR).logpdf(tear) - stats.uniform(0, 1).logpdf(tear)
     np.testing.assert_allclose(p.whole_evidence(torch.tensor(tear)), expected, atol=1e-9)
 
 
