@@ -8,7 +8,7 @@ from ...control_flow import fori_loop, traced
 from ..spacing import FADED, neighbours, spacing, square_distance
 from .scales import CANDIDATES, FAR, NEIGHBOURS, NONE, PREDICTION, RIDGE
 
-AVERAGE = 0.8
+AVERAGE = 0.8  # pitches, over which a deformation is averaged
 FITS = 6
 
 

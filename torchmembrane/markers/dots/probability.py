@@ -58,7 +58,7 @@ def own_evidence(found: Tensor, error: Tensor) -> Tensor:
 
     Example:
         >>> [round(x, 1) for x in own_evidence(torch.tensor([1.0, 1.0, 0.5]), torch.tensor([0.0, 0.3, 0.3])).tolist()]
-        [5.8, 2.6, -2.0]
+        [5.1, 1.9, -2.0]
     """
     odds = (found + LOST) / (1 - found + LOST)
     density = 0.5 * (PREDICTION / STEP_DEVIATION) ** 2

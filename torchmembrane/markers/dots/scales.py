@@ -3,13 +3,13 @@
 import math
 
 STEPS = 3
-"""Of every refinement."""
+"""Of the search's refinements, and of the fit."""
 REACH = 2.5
 """Of a dot from where it is expected, and of an edge between neighbours."""
 PREDICTION = 0.3
 """Standard deviation of where neighbours predict a dot, and of a step between them over its length."""
 NEIGHBOURS = 6
-"""Of a dot, that say something of it."""
+"""Of a dot, whose arrangement and steps are compared with those at rest."""
 CANDIDATES = int(math.pi * REACH**2)
 """Blobs among which a dot chooses, and for whose shifts it votes: as many as lie within `REACH`."""
 FAINT = 0.4
