@@ -9,7 +9,9 @@ from ...solve.elimination import solve_dense
 from ..neighbourhood import weighted_median
 from ..spacing import spacing, square_distance
 from .probability import LEAST
-from .scales import CANDIDATES, NONE, PREDICTION, REACH, STEPS
+from .scales import CANDIDATES, NONE, REACH, STEPS
+
+VOTE = 0.4  # pitches: width of a vote, distance of the shifts, and about where the affine map looks for blobs
 
 
 class Alignment(nn.Module):
@@ -33,7 +35,7 @@ class Alignment(nn.Module):
 
     def __init__(self, pixels: np.ndarray, seen: np.ndarray):
         super().__init__()
-        shifts = np.linspace(-REACH, REACH, 1 + 2 * round(REACH / PREDICTION))
+        shifts = np.linspace(-REACH, REACH, 1 + 2 * round(REACH / VOTE))
         self.register_buffer("pixels", torch.as_tensor(pixels))
         self.register_buffer("unit", torch.as_tensor(np.median(spacing(pixels)[0])))
         self.register_buffer("shifts", torch.as_tensor(shifts))
@@ -61,7 +63,7 @@ class Alignment(nn.Module):
         mapped, others = self.shifted(self.pixels @ typical.mT, blobs, weight)
         place = torch.where((others > votes)[:, None, None], mapped, before)
         for _ in range(STEPS):
-            place = self.mapped(place, blobs, weight, PREDICTION * self.unit)
+            place = self.mapped(place, blobs, weight, VOTE * self.unit)
         return place
 
     def shifted(self, place: Tensor, blobs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -71,7 +73,7 @@ class Alignment(nn.Module):
         index = near.topk(min(CANDIDATES, blobs.shape[1]), largest=False).indices
         there = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         offset = ((there - place[:, :, None]) / self.unit).flatten(1, 2)
-        along_u, along_v = torch.exp(-((offset[..., None] - self.shifts) / PREDICTION).square() / 2).unbind(2)
+        along_u, along_v = torch.exp(-((offset[..., None] - self.shifts) / VOTE).square() / 2).unbind(2)
         votes = ((along_u * weight.gather(2, index).flatten(1)[..., None]).mT @ along_v * self.home).flatten(1)
         most, best = votes.max(-1)
         count = len(self.shifts)

@@ -18,7 +18,7 @@ from .probability import LEAST, own_evidence
 from .scales import FAR, LOST, PREDICTION, STEPS
 from .steps import NeighbourSteps
 
-FOUND = 0.5  # certainty above which a dot counts as found
+FOUND = 0.3  # certainty above which a dot counts as found
 
 State = tuple[Tensor, Tensor, Tensor]
 """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""

@@ -44,8 +44,8 @@ def contrast_evidence(contrast: Tensor) -> Tensor:
     Both are normal, with `CONTRAST_DEVIATION` and 1 apart; `FAINT` is the middle between them.
 
     Example:
-        >>> contrast_evidence(torch.tensor([1.0, 0.4, 0.0])).round().tolist()
-        [12.0, 0.0, -8.0]
+        >>> contrast_evidence(torch.tensor([1.0, 0.35, 0.0])).round().tolist()
+        [13.0, 0.0, -7.0]
     """
     return (contrast - FAINT) / CONTRAST_DEVIATION**2
 

@@ -12,7 +12,7 @@ NEIGHBOURS = 6
 """Of a dot, whose arrangement and steps are compared with those at rest."""
 CANDIDATES = int(math.pi * REACH**2)
 """Blobs among which a dot chooses, and for whose shifts it votes: as many as lie within `REACH`."""
-FAINT = 0.4
+FAINT = 0.35
 """Contrast, over that of the frame's clearer dots, of what is as likely a dot as none."""
 SHADE = 0.05
 """Contrast of dirt and shade in any frame."""
