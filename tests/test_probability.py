@@ -55,6 +55,31 @@ def test_the_probability_is_one_over_one_and_all_odds_against():
     torch.testing.assert_close(p.probability(*evidence), 1 / (1 + (-evidence).exp().sum(0)))
 
 
+def test_a_dot_has_the_odds_of_its_window_its_contrast_its_size_and_its_neighbours_against_it():
+    """Contrasts count over the mean of the clearer half and `SHADE`; each further explanation adds its odds."""
+    generator = np.random.default_rng(0)
+    explained, contrast, found, error, other = (generator.uniform(0.1, 0.8, (2, len(REST))) for _ in range(5))
+    misfit, one = generator.uniform(0, 9, (2, len(REST))), np.ones((2, len(REST)))
+    seen = dots(torch.tensor(explained), torch.tensor(contrast))._replace(misfit=torch.tensor(misfit))
+    level = np.sort(contrast, 1)[:, len(REST) // 2 :].mean(1, keepdims=True) + p.SHADE
+    window = p.dot_evidence(torch.tensor(explained)).numpy(), p.contrast_evidence(torch.tensor(contrast / level)).numpy()
+    for own, others, got in (
+        ((one, 0 * one), (), p.alone(seen)),
+        ((found, error), (other,), p.among_neighbours(seen, *map(torch.tensor, (found, error, other)))),
+    ):
+        size = p.own_evidence(*map(torch.tensor, own)).numpy() - misfit / 2
+        np.testing.assert_allclose(got, 1 / (1 + sum(np.exp(-x) for x in (*window, size, *others))), atol=1e-9)
+
+
+def test_the_error_of_a_step_is_over_its_length():
+    """A pattern stretched by a tenth, its dots unevenly spaced, has that error everywhere."""
+    uneven = REST + np.random.default_rng(0).uniform(-6, 6, REST.shape)
+    one, flat = torch.ones(1, len(REST), dtype=torch.float64), torch.zeros(1, 2, 2, len(REST), dtype=torch.float64)
+    share, error = NeighbourSteps(uneven, np.ones(len(REST), bool))(torch.tensor(1.1 * uneven.T)[None], one, flat)
+    torch.testing.assert_close(error, 0.1 * one)
+    torch.testing.assert_close(share, one)
+
+
 def test_what_is_seen_clearly_among_its_neighbours_is_believed():
     assert judged(dots()).min() > 0.95
 

@@ -12,7 +12,7 @@ from ..spacing import spacing, square_distance
 from .scales import CANDIDATES, FAR, LOST, PREDICTION, REACH
 
 DOUBT = -log(LOST)  # what a lost dot costs, and a wrong step or size at most
-EXCHANGES = 20
+EXCHANGES = 20  # of messages between all neighbours
 
 
 def edges(pixels: np.ndarray) -> np.ndarray:

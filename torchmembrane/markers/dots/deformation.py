@@ -9,7 +9,7 @@ from ..spacing import FADED, neighbours, spacing, square_distance
 from .scales import CANDIDATES, FAR, NEIGHBOURS, NONE, PREDICTION, RIDGE
 
 AVERAGE = 0.8  # pitches, over which a deformation is averaged
-FITS = 6
+FITS = 6  # of a deformation to the blobs around
 
 
 def monomial_map() -> Tensor:
