@@ -83,7 +83,7 @@ class LocalDeformation(nn.Module):
         beside = torch.cat([others * there, there], 1)
         nearby = torch.exp((apart / (-2 * (AVERAGE * pitch[:, None]) ** 2)).clamp_min(-FADED)) * valid[..., None]
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
-        ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.5, 2)
+        ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.5, 2.0)
         return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
 
     @traced

@@ -59,7 +59,7 @@ class BlobDetector(nn.Module):
     in use, of up to `PREDICTION` times the pitch, and interpolated by a parabola.
 
     Args:
-        radii: of the pattern's dots `[D]`, px.
+        radii: of the pattern's dots `[D]`, px; their 5th to 95th percentile spans the scales.
         pitch: smallest distance of two dots, px.
         count: how many blobs are wanted.
         inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
@@ -76,7 +76,7 @@ class BlobDetector(nn.Module):
 
     def __init__(self, radii: np.ndarray, pitch: float, count: int, inside: Tensor):
         super().__init__()
-        smallest, largest = radii.min(), radii.max()
+        smallest, largest = np.percentile(radii, [5, 95])
         steps = np.log(max(largest / smallest, 1.001)) / np.log(SCALE_STEP)
         radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
         levels = np.log2(np.maximum(radii / np.sqrt(2), 1)).astype(int).clip(0, LEVELS - 1)
