@@ -11,6 +11,7 @@ from .bands import BandProduct, SeparableMap, blur_rows, linear_rows, pair_means
 from .pyramid import LEVELS
 from .scales import PREDICTION, SHADE
 
+FINEST_SIGMA = 0.9  # of the blob detector on a level of the pyramid, pixels of the level
 SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
 
 Span = tuple[int, int]
@@ -79,7 +80,7 @@ class BlobDetector(nn.Module):
         smallest, largest = np.percentile(radii, [5, 95])
         steps = np.log(max(largest / smallest, 1.001)) / np.log(SCALE_STEP)
         radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
-        levels = np.log2(np.maximum(radii / np.sqrt(2), 1)).astype(int).clip(0, LEVELS - 1)
+        levels = np.log2(np.maximum(radii / (FINEST_SIGMA * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
         height, width = inside.shape[-2:]
         self.cell = min(2 ** (int(levels[0]) + 1), 2 ** max(0, int(np.log2(PREDICTION * pitch))))
         self.reach, self.count = max(1, int(PREDICTION * pitch / self.cell)), count
