@@ -57,10 +57,10 @@ def traced(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
     Called with tensors, eagerly or compiled, it is the method itself.
 
     Args:
-        method: method of a module; it takes and gives tensors, or tuples of them.
+        method: a method of a module. It takes and returns tensors or tuples of tensors.
 
     Returns:
-        The method, which also accepts `Value`s and then returns them.
+        The method, which also accepts `Value`s; given these, it returns `Value`s.
 
     Example:
         >>> import torch
@@ -90,7 +90,7 @@ def onnx_function(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[
     own nodes. Eagerly and compiled it is the function itself.
 
     Args:
-        function: from a tensor to one of the same shape and type.
+        function: maps a tensor to a tensor of the same shape and type.
     """
 
     @wraps(function)
@@ -112,7 +112,7 @@ def onnx_function(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[
 
 @contextmanager
 def writing() -> Iterator[None]:
-    """Within, each call of an `onnx_function` is traced as one node."""
+    """Within the block, trace each call of an `onnx_function` as one node."""
     global _writing
     before, _writing = _writing, True
     try:
@@ -124,15 +124,15 @@ def writing() -> Iterator[None]:
 def fori_loop(
     step: Callable[..., Any], rows: int | Sequence[tuple[float, ...]], state: Sequence[Any], *given: Any
 ) -> Sequence[Any]:
-    """Repeat `state = step(*state, *given, *row)` for every row, and give the last state.
+    """Repeat `state = step(*state, *given, *row)` for every row, and return the last state.
 
-    A compiled graph holds the steps one after another, an exported model as a Loop.
+    A compiled graph unrolls the steps; an exported model contains a Loop.
 
     Args:
-        step: a `traced` method that gives the next state.
-        rows: the numbers of each step, or how many steps there are.
-        state: the values that a step changes.
-        given: the values that it only reads.
+        step: a `traced` method that returns the next state.
+        rows: the numbers that each step is given, or the number of steps.
+        state: initial values of what the steps change.
+        given: the values that the steps only read.
 
     Example:
         >>> fori_loop(lambda x, y, rate: (x + rate * y,), [(0.5,), (0.25,)], (1.0,), 4.0)
@@ -148,14 +148,15 @@ def fori_loop(
 
 
 def cond(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Sequence[Any]:
-    """Give `values` if `done` holds in every row, or else `otherwise()`.
+    """Return `values` if `done` holds in every row, otherwise the result of `otherwise()`.
 
-    Eagerly and in an exported model `otherwise` runs only if a row is not done; where Python cannot read `done` it always runs.
+    Eagerly and in an exported model, `otherwise` runs only if `done` is false in some row; where Python cannot read `done`, it
+    always runs.
 
     Args:
-        done: `[B]` bool.
-        values: tensors.
-        otherwise: gives as many tensors, of the same shapes.
+        done: `[B]` bool, the rows whose `values` are final.
+        values: tensors, returned if all rows are done.
+        otherwise: a function that returns as many tensors of the same shapes.
 
     Example:
         >>> cond(torch.tensor([True, False]), [torch.tensor(1)], lambda: [torch.tensor(2)])
@@ -174,15 +175,15 @@ def cond(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]
 def chunked(
     size: int, function: Callable[..., Sequence[torch.Tensor]], given: Sequence[Any], *constants: Any
 ) -> Sequence[torch.Tensor]:
-    """Give `function(*given, *constants)`, on a processor computed for at most `size` rows at a time.
+    """Return `function(*given, *constants)`, computed on a CPU in chunks of at most `size` rows.
 
-    There larger batches do not stay in the cache. Other devices, compiled graphs and exported models take all rows at once.
+    On a CPU, larger batches do not fit the cache. Other devices, compiled graphs and exported models process all rows at once.
 
     Args:
-        size: rows of a part.
-        function: gives tensors `[B, ...]`, each row from the same row of `given`.
-        given: tensors `[B, ...]`, or None.
-        constants: what all rows share.
+        size: largest number of rows in a chunk.
+        function: returns tensors `[B, ...]` of which each row depends only on the same row of `given`.
+        given: tensors `[B, ...]`, or None, that are split into chunks.
+        constants: arguments that all rows share.
 
     Example:
         >>> chunked(2, lambda x, add: (x + add, 2 * x), [torch.arange(3)], 1)
@@ -198,18 +199,18 @@ def chunked(
 def stacked(
     function: Callable[..., Sequence[torch.Tensor]], starts: Sequence[Sequence[Any]], given: Sequence[Any]
 ) -> list[Sequence[Any]]:
-    """Give `function(start, given)` for every start.
+    """Return `function(start, given)` for every start.
 
-    Tensors are joined to one batch, which takes little longer than one start where they are few and small. In an exported model
-    the starts follow one another.
+    The starts are concatenated to one batch, which takes little longer than one start if the tensors are few and small. An
+    exported model computes the starts one after another.
 
     Args:
-        function: gives tensors `[B, ...]`, each row from the same row of its arguments.
-        starts: sequences of as many tensors `[B, ...]`.
-        given: a named tuple of tensors `[B, ...]`, or None, that all starts share.
+        function: returns tensors `[B, ...]` of which each row depends only on the same row of its arguments.
+        starts: sequences of tensors `[B, ...]`, all equally long.
+        given: a named tuple that all starts share, of tensors `[B, ...]` or None.
 
     Returns:
-        What the function gives, by start.
+        The function's result for each start.
 
     Example:
         >>> from typing import NamedTuple
@@ -229,14 +230,14 @@ def stacked(
 
 
 def in_inference_mode(function: Callable[..., Output], *given: Any) -> Output:
-    """Give `function(*given)`, computed in inference mode where no gradient is recorded.
+    """Return `function(*given)`, computed in inference mode if gradients are disabled.
 
-    That saves a tenth of the time of many small tensors. The result is a copy of which gradients may be taken later. Compiled
-    graphs and exported models have no such mode.
+    Inference mode saves a tenth of the time of many small tensors. The result is a copy that may take part in later
+    computations of gradients. Compiled graphs and exported models have no such mode.
 
     Args:
-        function: gives a named tuple of tensors.
-        given: its arguments.
+        function: returns a named tuple of tensors.
+        given: arguments of the function.
 
     Example:
         >>> from typing import NamedTuple
@@ -258,15 +259,15 @@ def in_inference_mode(function: Callable[..., Output], *given: Any) -> Output:
 def where_rows(done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """Select `values` in the rows where `done` holds, and `others` in the rest.
 
-    It is a formula of tensors: call it within a `traced` method.
+    This function consists of tensor operations only: call it within a `traced` method.
 
     Args:
-        done: `[B]` bool.
+        done: `[B]` bool, the rows that are taken from `values`.
         values: tensors `[B, ...]`.
-        others: tensors of the same shapes.
+        others: tensors of the same shapes, for the other rows.
 
     Returns:
-        The tensors selected.
+        The selected tensors.
 
     Example:
         >>> where_rows(torch.tensor([True, False]), [torch.tensor([1, 2])], [torch.tensor([3, 4])])
@@ -285,18 +286,19 @@ def retry_rows(
     given: Sequence[Any],
     chosen: Callable[..., Any] | None = None,
 ) -> Sequence[Any]:
-    """Give `values` in the rows where `done` holds, and what `again(*given)` gives in the rest.
+    """Return `values` in the rows where `done` holds, and the result of `again(*given)` in the others.
 
-    Eagerly only the rows that are not done are computed again, on a device after one wait for `done`. An exported model
-    computes all rows again if one of them is not done, and a graph in which `done` cannot be read always does.
+    Eagerly, only the rows that are not done are recomputed; on an accelerator this takes one synchronisation, to read `done`.
+    An exported model recomputes all rows if one of them is not done, and a graph in which `done` cannot be read always
+    recomputes all.
 
     Args:
-        done: `[B]` bool.
-        values: tensors `[B, ...]`.
-        again: gives as many tensors of the same shapes, each row from the same row of `given`.
-        given: tensors `[B, ...]`, or None.
-        chosen: a `traced` method `chosen(done, values, others)` that selects row by row what is taken in place of all of
-            `others`; it gives `values` where `done` holds.
+        done: `[B]` bool, the rows whose `values` are final.
+        values: tensors `[B, ...]` of the first attempt.
+        again: returns as many tensors of the same shapes, of which each row depends only on the same row of `given`.
+        given: tensors `[B, ...]`, or None, the arguments of `again`.
+        chosen: a `traced` method `chosen(done, values, others)` that selects row by row between the two attempts; it returns
+            `values` where `done` holds. Default: all of `others` are taken.
 
     Returns:
         The tensors. No gradient of `given` passes through `again` in rows that are done.
@@ -327,9 +329,9 @@ def _retried(_: None, done: torch.Tensor, values: Sequence[torch.Tensor], others
 
 
 def can_sync(value: torch.Tensor) -> bool:
-    """Whether Python can read a tensor's values now, if need be after a wait for its device.
+    """Return whether Python can read a tensor's values now, if necessary after waiting for its device.
 
-    It cannot in a graph that is being compiled or exported, on the meta device, and while a CUDA graph is recorded.
+    It cannot while a graph is compiled or exported, on the meta device, or while a CUDA graph is recorded.
     """
     if torch.compiler.is_compiling() or value.is_meta:
         return False
@@ -337,7 +339,7 @@ def can_sync(value: torch.Tensor) -> bool:
 
 
 def _graph(values: Sequence[Any]) -> Graph | None:
-    """The graph of the first `Value` among the values, or in tuples among them."""
+    """Return the graph of the first `Value` among `values` and the tuples in them, or None without one."""
     for value in values:
         graph = value.graph if isinstance(value, Value) else _graph(value) if isinstance(value, (tuple, list)) else None
         if graph is not None:

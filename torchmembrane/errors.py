@@ -1,4 +1,4 @@
-"""The one exception family of torchmembrane, and the checks that raise it."""
+"""The package's one exception type, and the checks that raise it."""
 
 import functools
 import inspect
@@ -15,11 +15,11 @@ WORDS: dict[Any, str] = {
     **{float: "a number", int: "a whole number", bool: "True or False", str: "text", Path: "a path", NoneType: "None"},
     **{"Tensor": "a tensor or an array of numbers", "ndarray": "an array of numbers", "dtype": "a torch.dtype"},
 }
-"""What messages call a type, by itself or by its name."""
+"""Descriptions of types in messages, by the type or by its name."""
 
 
 class MembraneError(ValueError):
-    """A wrong file, value or shape; the message says what came, what was expected and the remedy.
+    """An invalid file, value or shape; the message says what was given, what was expected and how to correct it.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -31,13 +31,13 @@ class MembraneError(ValueError):
 
 
 def expect(right: bool, name: str, value: object, expected: str) -> None:
-    """Raise an error unless a value is right.
+    """Raise an error unless a condition on a value holds.
 
     Args:
-        right: whether it is.
-        name: what the value is called where the caller gave it.
-        value: what came.
-        expected: what is accepted, and the remedy.
+        right: whether the value is valid.
+        name: the value's name at the caller.
+        value: the value that was given.
+        expected: what is accepted, and how to correct it.
 
     Raises:
         MembraneError: `right` is false.
@@ -56,14 +56,14 @@ def expect(right: bool, name: str, value: object, expected: str) -> None:
 def check_arguments(target: Checked) -> Checked:
     """Decorate a public function or class so that its arguments are checked against their annotations.
 
-    A number is anything that Python accepts as one, a list any sequence, and an array anything that numpy converts to an array
-    of numbers. A missing or misnamed argument is Python's own error.
+    A number is anything that Python accepts as a number, a list is any sequence, and an array is anything that numpy converts
+    to an array of numbers. For a missing or misnamed argument, Python raises its own error.
 
     Args:
-        target: the function or class.
+        target: the function or class to decorate.
 
     Returns:
-        The function, which raises `MembraneError` for an argument of another type; the same class.
+        The decorated function, which raises `MembraneError` for an argument of the wrong type; of a class, the class itself.
 
     Example:
         >>> @check_arguments
@@ -99,7 +99,7 @@ def check_arguments(target: Checked) -> Checked:
 
 
 def _given(signature: inspect.Signature, arguments: tuple[Any, ...], options: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Names and values of the arguments of a call, except those that are the default; none if Python rejects the call."""
+    """Yield the names and values of a call's arguments that differ from their defaults; nothing if Python rejects the call."""
     try:
         bound = signature.bind(*arguments, **options).arguments
     except TypeError:
@@ -113,7 +113,7 @@ def _given(signature: inspect.Signature, arguments: tuple[Any, ...], options: di
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value has an annotation's type, or is accepted in its place."""
+    """Return whether a value has the type of an annotation, or is accepted in its place."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return True
@@ -154,7 +154,7 @@ def _is_list(value: Any) -> bool:
 
 
 def is_number(value: Any) -> bool:
-    """Whether Python accepts a value as a real number, which includes arrays and tensors without axes."""
+    """Return whether Python accepts a value as a real number; arrays and tensors without axes are included."""
     if getattr(value, "shape", None) not in (None, ()) or isinstance(value, str | bytes):
         return False
     try:
@@ -165,7 +165,7 @@ def is_number(value: Any) -> bool:
 
 
 def is_array(value: Any) -> bool:
-    """Whether a value is a tensor of real numbers, or can be converted to an array of real numbers by numpy."""
+    """Return whether a value is a tensor of real numbers, or can be converted to an array of real numbers by numpy."""
     import numpy as np
 
     if hasattr(value, "is_complex"):
@@ -177,7 +177,7 @@ def is_array(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """A value, short and in one line: arrays by their shape, objects by their type."""
+    """Return a short description of a value in one line: the shape of an array, the type of an object."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{type(value).__name__} {list(value.shape)} of {value.dtype}"
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | list | tuple | dict):

@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM end a command soon, whatever it is doing.
+"""Ctrl-C and SIGTERM end a command promptly, whatever it is doing.
 
-The first signal raises `Interrupted` in the main thread, as Python does for Ctrl-C. A thread sees to it that this ends the
-command: where the exception is lost in a callback, it is raised again; where the main thread is in compiled code that does not
-return, or a second signal comes, the process is ended, what it was writing is removed, and processes that it started are ended.
+The first signal raises `Interrupted` in the main thread, as Python does for Ctrl-C. A watching thread ensures that this ends
+the command. If the exception is lost in a callback, it is raised again. If the main thread is in compiled code that does not
+return, or if a second signal arrives, the process is ended; its unfinished files are removed and its child processes are ended.
 """
 
 import os
@@ -22,19 +22,19 @@ from typing import Any, NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 SAID = "torchmembrane: interrupted; what is done so far is kept"
 PATIENCE = 1.5
-"""Seconds after which the process is ended, if the main thread has not answered."""
+"""Seconds after a signal until the process is ended if the main thread has not responded."""
 LONGER = 10.0
-"""The same where a frame is computed, and for what is closed after the exception."""
+"""The same limit while a frame is computed, and for the clean-up after the exception."""
 AGAIN = 0.5
-"""Share of these times after which the exception is requested once more."""
+"""Share of these times after which the exception is raised once more."""
 APART = 0.3
-"""Seconds within which several signals are one: groups of processes may be sent it twice."""
+"""Seconds within which several signals count as one: a process group may receive a signal twice."""
 LOOK = 0.05
-"""Seconds between two looks at what became of a signal."""
+"""Seconds between two checks of how a signal was handled."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal has come.
+    """The exception that a signal raises.
 
     Attributes:
         number: number of the signal.
@@ -46,14 +46,14 @@ class Interrupted(KeyboardInterrupt):
 
 
 class _State:
-    """The state of the signals of one command.
+    """The state of signal handling in one command.
 
     Attributes:
-        number: number of the first signal; 0: none yet.
-        answered: whether the main thread has it, and ends.
-        raised: whether it has it as an exception.
-        lost: whether its exception went nowhere.
-        held: how often `starting_processes` holds it back.
+        number: number of the first signal; 0 before one has arrived.
+        answered: whether the main thread has received the signal and is ending.
+        raised: whether it has received the signal as an exception.
+        lost: whether the exception was lost, for example in a callback.
+        held: number of nested `starting_processes` blocks that delay the signal.
     """
 
     def __init__(self) -> None:
@@ -61,14 +61,14 @@ class _State:
         self.answered = self.raised = self.lost = False
 
     def on_signal(self, number: int, _: object) -> None:
-        """Raise the exception once: later signals must not disturb the clean-up after the first one."""
+        """Raise the exception for the first signal only: later ones must not disturb the clean-up."""
         self.number = self.number or number
         if not self.answered and not self.held:
             self.answered = self.raised = True
             raise Interrupted(self.number)
 
     def patience(self) -> float:
-        """Seconds from the signal after which the process is ended."""
+        """Return the seconds from the signal until the process is ended."""
         return LONGER if not _unstoppable and (self.answered or _frames) else PATIENCE
 
 
@@ -80,10 +80,11 @@ _unfinished: set[Path] = set()
 
 @contextmanager
 def ended_by_signals() -> Iterator[Callable[[], int]]:
-    """Within a block, SIGINT and SIGTERM raise `Interrupted` in the main thread, or end the process; not in other threads.
+    """Within the block, let SIGINT and SIGTERM raise `Interrupted` in the main thread or end the process; no effect in other
+    threads.
 
     Yields:
-        A function that gives the number of the signal whose exception was raised; 0: none.
+        A function that returns the number of the signal whose exception was raised; 0 without one.
     """
     global _state
     state = _state = _State()
@@ -114,27 +115,27 @@ def ended_by_signals() -> Iterator[Callable[[], int]]:
 
 
 def answer() -> None:
-    """Declare that the main thread knows of the signal and is ending, so that the exception is not raised in it again."""
+    """Declare that the main thread has noticed the signal and is ending, so that the exception is not raised again."""
     _state.answered = True
 
 
 @contextmanager
 def unstoppable() -> Iterator[None]:
-    """For code that does not return to Python for a long time, in any thread: a signal within the block ends the process."""
+    """Mark code, in any thread, that does not return to Python for a long time: a signal within the block ends the process."""
     with _within(_unstoppable):
         yield
 
 
 @contextmanager
 def frame_in_work() -> Iterator[None]:
-    """For the computation of frames, which may take longer than `PATIENCE` and is waited for."""
+    """Mark the computation of frames, which may take longer than `PATIENCE`, so that its end is awaited."""
     with _within(_frames):
         yield
 
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[None]:
-    """Remove an unfinished file or folder at the end of a block, also if the process is ended within it."""
+    """Remove an unfinished file or folder at the end of the block, even if the process is ended within it."""
     _unfinished.add(path)
     try:
         yield
@@ -144,16 +145,17 @@ def unfinished(path: Path) -> Iterator[None]:
 
 
 def remove_unfinished() -> None:
-    """Remove the unfinished files of this process."""
+    """Remove all unfinished files of this process."""
     for path in list(_unfinished):
         _remove(path)
 
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """For the start of processes: a signal is raised only when they have started, and Ctrl-C does not reach them.
+    """Delay a signal until the processes started in the block are running, and shield them from Ctrl-C.
 
-    A process that is interrupted while it starts would print a traceback; one that its parent does not know yet would stay.
+    A process that is interrupted while it starts would print a traceback; one that its parent does not know yet would be left
+    running.
     """
     state = _state
     state.held += 1
@@ -167,10 +169,10 @@ def starting_processes() -> Iterator[None]:
 
 
 def end_process(number: int) -> NoReturn:
-    """Print a message and end this process and those that it has started, without Python's usual clean-up, which takes long.
+    """Print a message and end this process and its children, without Python's usual clean-up, which takes long.
 
     Args:
-        number: number of the signal that has come.
+        number: number of the signal that was received.
     """
     os.write(2, f"{SAID}\n".encode())
     if "multiprocessing" in sys.modules:
@@ -181,7 +183,7 @@ def end_process(number: int) -> NoReturn:
 
 
 def _watch(state: _State, reader: socket.socket) -> None:
-    """End the process if the main thread does not, or is told a second time to."""
+    """End the process if the main thread does not end in time, or if a second signal arrives."""
     with reader:
         number = 0
         while number not in SIGNALS:  # others have handlers of their own
@@ -205,7 +207,7 @@ def _watch(state: _State, reader: socket.socket) -> None:
 
 @contextmanager
 def _blocked() -> Iterator[None]:
-    """Start processes within a block that Ctrl-C does not reach: they inherit this thread's blocked signal."""
+    """Shield processes that are started within the block from Ctrl-C: they inherit this thread's blocked signal."""
     from multiprocessing.resource_tracker import ensure_running
 
     ensure_running()  # it would let the signal in again

@@ -1,6 +1,6 @@
-"""Functions of arrays compiled to machine code by numba at their first call: loops for one frame at a time.
+"""Compilation of functions of arrays to machine code by numba at their first call, for loops over one frame at a time.
 
-Compiling takes about `SECONDS`, once for each precision; the code is kept on disk. If that is not worth the wait,
+Compilation takes about `SECONDS`, once for each precision; the machine code is cached on disk. To avoid that wait,
 `using(False)` switches to tensor operations, which give the same numbers up to rounding.
 """
 
@@ -23,14 +23,14 @@ from torch import Tensor
 from .interruption import unstoppable
 
 SECONDS = 45
-"""Compiling the steps for one precision takes about this long: 30 s on a core with AVX-512, 62 s on an AMD EPYC with AVX2."""
+"""Approximate time to compile the steps for one precision: 30 s on a core with AVX-512, 62 s on an AMD EPYC with AVX2."""
 
 _used = ContextVar("machine code is used", default=True)
 
 
 @contextmanager
 def using(wanted: bool) -> Iterator[None]:
-    """Set within a block whether machine code or tensor operations are used.
+    """Choose for the block whether machine code or tensor operations are used.
 
     Example:
         >>> with using(False):
@@ -45,12 +45,12 @@ def using(wanted: bool) -> Iterator[None]:
 
 
 def is_used() -> bool:
-    """Whether machine code may be used here."""
+    """Return whether machine code may be used here."""
     return _used.get()
 
 
 def takes(*values: Any) -> bool:
-    """Whether machine code computes with these tensors: on a processor, alone, without gradients."""
+    """Return whether machine code can compute with these tensors: on a CPU, without gradients or `torch.func` transforms."""
     tensors = [value for value in values if value is not None]
     return (
         not torch.compiler.is_compiling()
@@ -62,21 +62,22 @@ def takes(*values: Any) -> bool:
 
 
 OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-"""NaN and infinity are what they are, sums come in any order."""
+"""Options of fast arithmetic: NaN and infinity keep their meaning, and sums may be reordered."""
 
 INNER: dict[str, Any] = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 compiled = numba.njit(**OPTIONS, **INNER)
-"""Of a function that others call, not Python: its arguments would take as long to unpack as it takes to compile.
+"""Decorate a function that only compiled code calls, not Python: unpacking its arguments would take as long to compile as the
+function itself.
 
-What is quick to compile: a constant argument is passed as `np.intp(4)` or `np.bool_(True)`, as a function is compiled again for
-each literal; loops that need not be unrolled run to a length that is read from an array.
+To keep compilation fast, pass constant arguments as `np.intp(4)` or `np.bool_(True)`, because a function is compiled again for
+each literal, and let loops that need not be unrolled take their length from an array.
 """
 
 
 def kept(function: Callable[..., Any]) -> Any:
-    """Decorate a function so that it is compiled and kept on disk, beside its file or in the user's cache, until that file
-    changes; if neither can be written, it is kept in this process only.
+    """Decorate a function so that it is compiled and cached on disk, beside its file or in the user's cache, until that file
+    changes. If neither place can be written, the code is cached in this process only.
 
     Example:
         >>> kept(lambda x: 2 * x)(3)
@@ -89,12 +90,12 @@ def kept(function: Callable[..., Any]) -> Any:
 
 
 class Kept:
-    """The state of a `kept` function: the precisions for which it has been compiled, in this process or on disk.
+    """The compilation state of a `kept` function: the precisions compiled so far, in this process or on disk.
 
     Args:
-        function: the compiled function that `kept` gives.
-        sources: `fingerprint` of its sources.
-        seconds: about how long it takes to compile.
+        function: the compiled function that `kept` returns.
+        sources: `fingerprint` of its source files.
+        seconds: approximate time of its compilation, s.
     """
 
     def __init__(self, function: Any, sources: str, seconds: int = SECONDS):
@@ -108,13 +109,13 @@ class Kept:
         self.lock = Lock()
 
     def is_compiled(self, dtype: np.dtype[Any]) -> bool:
-        """Whether a call with arrays of this precision finds machine code."""
+        """Return whether machine code for arrays of this precision exists."""
         if dtype.name not in self.known and self.folder and self._mark(dtype).exists():
             self.known.add(dtype.name)
         return dtype.name in self.known
 
     def compiling(self, dtype: np.dtype[Any]) -> AbstractContextManager[None]:
-        """For a call: if it compiles, this is logged, and noted when it is done."""
+        """Enclose a call; if the call compiles, log this first and record it afterwards."""
         return nullcontext() if dtype in self.called else self._compiling(dtype)
 
     @contextmanager
@@ -140,13 +141,13 @@ class Kept:
 
 
 def fingerprint(*files: str | None) -> str:
-    """A hash of source files: a `kept` function with it in its closure is compiled again after one of them has changed."""
+    """Return a hash of source files: a `kept` function with it in its closure is compiled again when one of them changes."""
     return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
 
 
 def row_major(constants: Any) -> Any:
-    """Constants of a `kept` function, an array or (named) tuples of them, with every array in row-major order, contiguous: a
-    function is compiled again for each layout of each array.
+    """Return the constants of a `kept` function, an array or (named) tuples of arrays, with contiguous arrays in row-major
+    order. A function is compiled again for each memory layout of each array.
 
     Example:
         >>> row_major((np.zeros((3, 4))[:, :2], 1.0))[0].flags.c_contiguous
@@ -161,7 +162,7 @@ def row_major(constants: Any) -> Any:
 
 
 def aligned(size: int, dtype: np.dtype) -> np.ndarray:
-    """An array of zeros whose address is a multiple of 64 bytes.
+    """Return an array of zeros whose address is a multiple of 64 bytes.
 
     Example:
         >>> aligned(3, np.dtype("float32")).ctypes.data % 64

@@ -1,4 +1,4 @@
-"""Poses: points, vectors and wrenches from the camera's frame to a tool's, or from one view's to another's."""
+"""Poses that map points, vectors and wrenches from the camera's frame to a tool's, or from one view's frame to another's."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -18,19 +18,19 @@ ORTHOGONAL = 1e-3  # largest entry of R^T R - 1: rotations are written with thre
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """The pose of a frame in another one, from the first to the other: `p_other = rotation p + translation`.
+    """The pose of one frame in another, which maps from the first to the second: `p_other = rotation p + translation`.
 
-    A sensor's `tool` is the pose of the camera's frame in the tool's: the columns of its rotation are the directions of the
-    camera's x (right in the image), y (down) and z (out of the lens) in the tool's frame, its translation is where the centre
-    of projection is there.
+    A sensor's `tool` is the pose of the camera's frame in the tool's frame. The columns of its rotation are the camera's axes x
+    (right in the image), y (down) and z (out of the lens) in the tool's frame; its translation is the position of the centre of
+    projection in that frame.
 
     Args:
-        rotation: `[3, 3]` rows of an orthogonal matrix of determinant 1; or a rotation vector `[3]`, degrees, which is kept as
-            the matrix.
+        rotation: `[3, 3]` rows of an orthogonal matrix of determinant 1, or a rotation vector `[3]` in degrees, which is
+            converted to the matrix.
         translation: `[3]`, length unit.
 
     Raises:
-        MembraneError: a rotation that is none, values that are not finite; says what came and what was expected.
+        MembraneError: `rotation` is not a rotation, or a value is not finite.
 
     Example:
         The camera sits 30 above the tool's origin and looks down.
@@ -67,7 +67,7 @@ class Pose:
         object.__setattr__(self, "translation", translation)
 
     def points(self, points: Values) -> Values:
-        """Points in the other frame, `R p + t`.
+        """Map points to the other frame, `R p + t`.
 
         Args:
             points: `[..., 3]`, length unit, tensor or array.
@@ -80,7 +80,7 @@ class Pose:
         return moved
 
     def vectors(self, vectors: Values) -> Values:
-        """Forces, normals and displacements in the other frame, `R f`.
+        """Map forces, normals or displacements to the other frame, `R f`.
 
         Args:
             vectors: `[..., 3]`, tensor or array.
@@ -93,7 +93,7 @@ class Pose:
         return turned
 
     def wrench(self, wrench: Values) -> Values:
-        """A wrench in the other frame, its moment about that frame's origin: `(R f, R m + t x R f)`.
+        """Map a wrench to the other frame, with its moment about that frame's origin: `(R f, R m + t x R f)`.
 
         Args:
             wrench: `[..., 6]`, force and moment about this frame's origin, tensor or array.
@@ -111,7 +111,7 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class ViewPose(Pose):
-    """The pose of a view's frame in the first view's; a view by a mirror is reflected, with determinant -1.
+    """The pose of a view's frame in the first view's frame; for a view through a mirror it is a reflection, of determinant -1.
 
     Args:
         rotation: `[3, 3]` rows of an orthogonal matrix, or a rotation vector `[3]`, degrees.
@@ -127,10 +127,10 @@ class ViewPose(Pose):
 
     @classmethod
     def of_matrix(cls, matrix: np.ndarray) -> "ViewPose":
-        """The pose that a matrix `[4, 4]` of homogeneous coordinates describes.
+        """Return the pose described by a matrix `[4, 4]` of homogeneous coordinates.
 
         Raises:
-            MembraneError: another shape or last row, or rows that are not orthogonal.
+            MembraneError: the shape or the last row is wrong, or the rows are not orthogonal.
         """
         given = np.asarray(matrix, float)
         right = given.shape == (4, 4) and np.array_equal(given[3], [0, 0, 0, 1])
@@ -139,23 +139,23 @@ class ViewPose(Pose):
 
     @property
     def matrix(self) -> np.ndarray:
-        """The same as a matrix `[4, 4]` of homogeneous coordinates."""
+        """Return the pose as a matrix `[4, 4]` of homogeneous coordinates."""
         rows: np.ndarray = np.vstack([np.column_stack([self.rotation, self.translation]), [0.0, 0.0, 0.0, 1.0]])
         return rows
 
     @property
     def determinant(self) -> int:
-        """1, or -1 of a reflection."""
+        """Return 1 for a rotation, -1 for a reflection."""
         return 1 if np.linalg.det(self.rotation) > 0 else -1
 
     @property
     def inverse(self) -> "ViewPose":
-        """The pose of the first view's frame in this one's."""
+        """Return the pose of the first view's frame in this view's frame."""
         return ViewPose(self.rotation.T, -self.rotation.T @ self.translation)
 
 
 def _checked(name: str, values: Any, count: int) -> Any:
-    """Values `[..., count]` as a tensor or an array of floating point."""
+    """Return `values [..., count]` as a floating-point tensor or array."""
     if not is_array(values):
         raise MembraneError(f"{name}: a {type(values).__name__}; expected a tensor or an array [..., {count}]")
     given = values if hasattr(values, "new_tensor") else np.asarray(values)
@@ -167,12 +167,12 @@ def _checked(name: str, values: Any, count: int) -> Any:
 
 
 def _like(values: Values, constant: np.ndarray) -> Values:
-    """A constant of the kind and precision of the values."""
+    """Return a constant as a tensor or array, like `values` and of the same precision."""
     return constant.astype(values.dtype) if isinstance(values, np.ndarray) else values.new_tensor(constant)
 
 
 def _turned_by(vector: np.ndarray) -> np.ndarray:
-    """The rotation about a vector `[3]` by its length, rad (Rodrigues): `1 + sin a / a K + (1 - cos a) / a^2 K^2`."""
+    """Return the rotation about a vector `[3]` by its length in rad (Rodrigues): `1 + sin a / a K + (1 - cos a) / a^2 K^2`."""
     (x, y, z), angle = vector, np.linalg.norm(vector)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turned: np.ndarray = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * K @ K

@@ -1,4 +1,4 @@
-"""Worker processes with one thread each, which end with this process."""
+"""Worker processes with one thread each, which end together with this process."""
 
 import os
 import pickle
@@ -19,12 +19,12 @@ from .interruption import starting_processes, unfinished
 
 @contextmanager
 def spawned_pool(jobs: int, begin: Callable[[Path], None], shared: Any) -> Iterator[Any]:
-    """A `multiprocessing.Pool` of new processes; they are ended with the block.
+    """Provide a `multiprocessing.Pool` of new processes that end with the block.
 
     Args:
         jobs: number of processes.
-        begin: function that each process calls at its start with the path of a file; it calls `begin_worker`.
-        shared: object that this file holds, pickled.
+        begin: function that each process calls when it starts, with the path of a file; it calls `begin_worker`.
+        shared: object that is pickled into this file.
     """
     with handed_over(shared) as path:
         with starting_processes():
@@ -35,10 +35,10 @@ def spawned_pool(jobs: int, begin: Callable[[Path], None], shared: Any) -> Itera
 
 @contextmanager
 def handed_over(shared: Any) -> Iterator[Path]:
-    """A file with a pickled object for new processes.
+    """Provide a file with a pickled object for new processes.
 
-    Through a pipe, one process would have to be running before the next one starts. Plain pickle is used, because torch's would
-    move tensors to shared memory, away from arrays that share theirs.
+    With a pipe, each process would have to be running before the next one starts. Plain pickle is used because torch's version
+    would move tensors to shared memory and separate them from the arrays that share their data.
     """
     folder = Path(mkdtemp())
     with unfinished(folder):
@@ -49,13 +49,13 @@ def handed_over(shared: Any) -> Iterator[Path]:
 
 
 def begin_worker(path: Path) -> Any:
-    """Set up a worker process: it uses one thread, and only its parent interrupts and ends it.
+    """Set up a worker process: it uses one thread, and only its parent can interrupt and end it.
 
     Args:
-        path: as for `handed_over` gave it.
+        path: the file that `handed_over` provided.
 
     Returns:
-        What was handed over.
+        The object in the file.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""From images to surfaces: `Reconstructor`, an `nn.Module` that holds everything constant of one sensor."""
+"""From images to surfaces: `Reconstructor`, an `nn.Module` that holds all constants of one sensor."""
 
 import copy
 from collections.abc import Sequence
@@ -34,29 +34,30 @@ from .state_dict import drop_derived_buffers
 from .surface.bicubic import bicubic_shares
 from .surface.levers import Levers
 
-MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
-LARGEST_RESIDUAL = 1.5  # px, of a plausible answer, however noisy its image
+MODEL_ERROR = 0.004  # error of the model's marker positions, over the rms displacement of all markers
+LARGEST_RESIDUAL = 1.5  # px, largest residual of a plausible solution, however noisy the image
 
 
 class Reconstructor(nn.Module):
-    """Images of one sensor to surfaces, called with images; `from_pixels` starts from markers located elsewhere.
+    """Reconstructs surfaces from the images of one sensor, or with `from_pixels` from markers located elsewhere.
 
     Args:
-        sensor: a `Sensor` (`Reconstructor.from_file` reads one).
-        estimator: "force-balance"; "minimum-energy", which finds no tractions and flattens what is narrow and far; or "paper",
-            the paper's own: linear, harmonic, with its contact segmentation; or one of your own: the name it is registered
-            under, "module:Class", or the class.
-        settings: settings of that estimator, an instance of its `Settings`, as `ForceBalanceSettings`; default: `Settings()`.
-        model: the elastic energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
+        sensor: the `Sensor`; `Reconstructor.from_file` reads it from a file.
+        estimator: "force-balance"; "minimum-energy", which finds no tractions and flattens narrow and distant contacts;
+            "paper", the paper's linear harmonic method with its contact segmentation; or your own: its registered name,
+            "module:Class", or the class.
+        settings: settings of that estimator, an instance of its `Settings`, such as `ForceBalanceSettings`; default:
+            `Settings()`.
+        model: elastic energy, "harmonic" | "neo_hookean" | "mooney_rivlin"; default: the sensor's.
         channels: order of the channels of colour images, "rgb" or "bgr".
-        dtype: of images and results, torch.float32 or torch.float64; slack sheets are always solved in the latter.
-        locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses; default:
-            the estimator's: "soft" for "paper", else "fit".
-        check_rest: whether a rest image that disagrees with the model by more than calibration could explain is refused.
+        dtype: precision of images and results, torch.float32 or torch.float64; slack sheets are always solved in float64.
+        locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of filter responses;
+            default: "soft" for the estimator "paper", otherwise "fit".
+        check_rest: whether to refuse a rest image that deviates from the model by more than a calibration error could explain.
 
     Raises:
-        MembraneError: an unknown estimator or locator, settings of another one, a sensor that cannot see its membrane or
-            its markers, or whose rest image disagrees with it.
+        MembraneError: the estimator or locator is unknown, the settings belong to another estimator, the camera cannot see the
+            membrane or its markers, or the rest image contradicts the sensor.
 
     Example:
         >>> reconstructor = Reconstructor.from_file("examples/sensor.toml")
@@ -112,7 +113,8 @@ class Reconstructor(nn.Module):
         drop_derived_buffers(self)
 
     def _solve_by(self, estimator: Estimator, dtype: torch.dtype) -> None:
-        """Take an estimator, in a precision unless it must be in double, as of a slack sheet: so is what it is given then."""
+        """Use this estimator in precision `dtype`, or in float64 if it requires that (slack sheets), then with inputs in
+        float64."""
         self.estimator = estimator if estimator.solves_in_double else estimator.to(dtype)
         if estimator.solves_in_double:
             self.observer.be_exact()
@@ -120,7 +122,7 @@ class Reconstructor(nn.Module):
     @classmethod
     @check_arguments
     def from_file(cls, path: str | Path, estimator: str | type[Estimator] = "force-balance", **options: Any) -> "Reconstructor":
-        """The reconstructor of a sensor file; options as for the class."""
+        """Return the reconstructor of a sensor file; the options are those of the class."""
         sensor = Sensor.from_file(path)
         try:
             return cls(sensor, estimator, **options)
@@ -129,23 +131,24 @@ class Reconstructor(nn.Module):
 
     @property
     def rest_pixels(self) -> Tensor:
-        """Where the model sees the markers at rest, `[D, 2]` px; of several views `[W, D, 2]`."""
+        """Return the pixels of the markers at rest according to the model, `[D, 2]` px; for several views `[W, D, 2]`."""
         return self.observer.by_view(self.observer.rest_pixels[None])[0]
 
     @property
     def rest_pressure(self) -> Tensor:
-        """Pressure difference across the membrane at rest, `[]`, force / length^2."""
+        """Return the pressure difference across the membrane at rest, `[]`, force / length^2."""
         return self.estimator.rest_pressure
 
     @property
     def finds_tractions(self) -> bool:
-        """Whether tractions and standard deviations are found."""
+        """Return whether the estimator finds tractions and standard deviations."""
         return self.estimator.finds_tractions
 
     @check_arguments
     def read(self, *paths: str | Path) -> Tensor:
-        """Image files, one or more, as a batch `[B, 1, height, width]` in 0..1, of this module's precision and device. Of views
-        with images of their own those of the first view, NAME_VIEW; the others lie beside them, what cannot be read is NaN."""
+        """Read one or more image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its
+        device. If views have separate images, pass the first view's, NAME_VIEW; the others lie beside them. Unreadable files
+        become NaN."""
         expect(len(paths) > 0, "Reconstructor.read: paths", list(paths), "one image file or more")
         if self.sensor.views_apart:
             return torch.cat([read_views(Path(path), self.sensor.views, self.rest_pixels).grey for path in paths])
@@ -163,18 +166,22 @@ class Reconstructor(nn.Module):
 
         Args:
             images: torch or numpy, uint8, uint16 or float in 0..1: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or
-                `[B, H, W, 1 | 3]`; of W views a list of W of these, None without. Grey is 0.299 R + 0.587 G + 0.114 B.
-            previous: results of the frames before, where dots are looked for first; a texture is looked for as from rest.
-            rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the sensor's rest image.
-            pressure: `[B]` or a number, difference across the membrane that a gauge reads, unit as of the result's, NaN where
-                none is (force balance; `pressure_noise` in its settings). Of a change since rest, add `rest_pressure`.
+                `[B, H, W, 1 | 3]`; for W views a list of W of these, with None for a missing image. Colours are converted to
+                grey by 0.299 R + 0.587 G + 0.114 B.
+            previous: results of the preceding frames, from which the search for dots starts; texture is always searched for
+                from rest.
+            rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: those in the sensor's rest
+                image.
+            pressure: `[B]` or a number, measured pressure difference across the membrane in the result's unit, NaN where not
+                measured (force balance only; see `pressure_noise` in its settings). If your gauge measures the change since
+                rest, add `rest_pressure`.
 
         Returns:
-            A `Reconstruction`. A frame that cannot be reconstructed gets a status and NaN, the others are not touched.
+            A `Reconstruction`. A frame that cannot be reconstructed gets a status and NaN; the others are not affected.
 
         Raises:
-            MembraneError: another size, shape or type; a previous result of another batch or sensor; a pressure of an open
-                cavity, or for another estimator.
+            MembraneError: the size, shape or type is wrong, `previous` belongs to another batch or sensor, or a pressure is
+                given for an open cavity or for another estimator.
         """
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
@@ -184,7 +191,7 @@ class Reconstructor(nn.Module):
             return self.reconstruct_grey(grey, before, rest, pressure)
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
-        """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
+        """Convert images, in any form that `forward` accepts, to grey images `[B, 1, height, width]` in 0..1."""
         if self.sensor.views_apart:
             return grey_views(images, self.sensor.views, self.channels, self.rest_pixels)
         return to_grayscale_batch(images, self.image_size, self.channels, self.rest_pixels, self.sensor.camera.bits)
@@ -196,8 +203,8 @@ class Reconstructor(nn.Module):
         rest_pixels: Tensor | None = None,
         pressure: Tensor | float | None = None,
     ) -> Reconstruction:
-        """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision and `pixels [B, D, 2]`
-        of the frames before; nothing is checked."""
+        """Do the same as `forward` with grey images `[B, 1, height, width]` in 0..1, in this module's precision, and the
+        `pixels [B, D, 2]` of the preceding frames; nothing is checked."""
         return in_inference_mode(self._seen, grey, before, rest_pixels, pressure)
 
     def from_pixels(
@@ -208,17 +215,20 @@ class Reconstructor(nn.Module):
         pressure: Tensor | float | None = None,
         noise: float | None = None,
     ) -> Reconstruction:
-        """Reconstruct from marker centres located elsewhere; those that belong with no neighbour get confidence 0.
+        """Reconstruct from marker centres located elsewhere; those that contradict their neighbours get confidence 0.
 
         Args:
-            pixels: `[B, D, 2]` or `[D, 2]` in the sensor file's order, NaN where lost; of W views `[B, W, D, 2]`.
-            confidence: `[B, D]` or `[D]` in 0..1, of W views `[B, W, D]`; default: 1 where finite.
-            rest_pixels: `[D, 2]`, of W views `[W, D, 2]`, the same markers in the rest image; default: the model's rest pixels.
-            pressure: as for images.
-            noise: standard deviation of one marker's u and v, px; default: 0.05 in these images, and at rest the rest image's.
+            pixels: `[B, D, 2]` or `[D, 2]` px in the order of the sensor file, NaN for lost markers; for W views `[B, W, D,
+                2]`.
+            confidence: `[B, D]` or `[D]` in 0..1, for W views `[B, W, D]`; default: 1 where the pixels are finite.
+            rest_pixels: `[D, 2]`, for W views `[W, D, 2]`, the same markers in the rest image; default: the model's rest
+                pixels.
+            pressure: measured pressure, as for `forward`.
+            noise: standard deviation of a marker's u and v, px; default: 0.05 for these pixels, the rest image's for those at
+                rest.
 
         Raises:
-            MembraneError: another shape, or a confidence outside 0..1.
+            MembraneError: the shape is wrong, or a confidence lies outside 0..1.
         """
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
@@ -238,8 +248,8 @@ class Reconstructor(nn.Module):
 
     @traced
     def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
-        """What the estimator is given, from the markers' displacements `[B, D, 2]`, confidence `[B, D]` and covariance
-        `[B, D, 2, 2]`; default: that of the rest image's."""
+        """Return the estimator's input, from the markers' displacements `[B, D, 2]` px, confidence `[B, D]` and covariance `[B,
+        D, 2, 2]` px^2; default: twice the covariance of the markers in the rest image."""
         covariance = 2 * self.observer.rest_covariance if covariance is None else covariance
         found = (confidence > 0).to(confidence.dtype)
         square = (found * displacement.square().sum(-1)).sum(-1) / found.sum(-1).clamp_min(1)
@@ -252,7 +262,7 @@ class Reconstructor(nn.Module):
     def result(
         self, found: Equilibrium, observation: Observation, displacement: Tensor, confidence: Tensor, status: Tensor
     ) -> Reconstruction:
-        """The frames' results, NaN where there is no surface."""
+        """Return the results of the frames, NaN where no surface was found."""
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND_CONFIDENCE, found.vertices
         u = x - membrane.rest
         markers = self.rest_markers + self.marker_shares @ u.to(self.marker_shares)
@@ -295,7 +305,7 @@ class Reconstructor(nn.Module):
     def _judged(
         self, status: Tensor, found: Equilibrium, normals: Tensor, residual: Tensor, coverage: Tensor, broken: Tensor
     ) -> Tensor:
-        """Statuses `[B]`, of frames that had none before the solve too: of several that hold the last."""
+        """Return the final statuses `[B]`: frames already rejected keep theirs; of several that apply, the last one counts."""
         ok, displaced = is_seen(status), self.camera.is_displaced(found.moved)
         unlike = (residual[..., None] > LARGEST_RESIDUAL).flatten(1).any(1)
         for of_this, value in (
@@ -309,19 +319,19 @@ class Reconstructor(nn.Module):
         return status
 
     def _facings(self, points: Tensor, normals: Tensor) -> Tensor:
-        """How the markers at `points [..., D, 3]` face what sees them, for each sighting."""
+        """Return, for each sighting, how directly the markers at `points [..., D, 3]` face the camera that sees them."""
         return facings(self.camera.lines_of_sight(self.observer.seen_by_each(points)), self.observer.seen_by_each(normals))
 
     def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
-        """The observation with what a gauge reads, if one does."""
+        """Return the observation with the measured pressure, if there is one."""
         return observation if pressure is None else self.estimator.gauged(observation, tensor_of("pressure", pressure))
 
     def fields(self, result: Reconstruction, names: Sequence[str] = FIELDS) -> dict[str, Tensor]:
-        """Principal "stretch" and "tension" (force / length) at the vertices of `result`, `[B, V, 2]` by their names, as of
-        `principal_fields`; NaN where there is no surface.
+        """Return the principal "stretch" and "tension" (force / length) at the vertices of `result`, a dict of `[B, V, 2]` as
+        computed by `principal_fields`; NaN where no surface was found.
 
         Raises:
-            MembraneError: another name, or an estimator without an `elasticity`.
+            MembraneError: a name is unknown, or the estimator has no `elasticity`.
         """
         if unknown := [name for name in names if name not in FIELDS]:
             raise MembraneError(f"Reconstructor.fields: {unknown[0]!r}; expected {', '.join(FIELDS)}")
@@ -330,11 +340,11 @@ class Reconstructor(nn.Module):
         return {name: principal_fields(elasticity, self.estimator.membrane, result.vertices, name) for name in names}
 
     def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
-        """Of vertices, total force and pressure of `result`, caused by the locator's noise, and by that of a gauge where its
-        `pressure` was given; NaN where there is no surface.
+        """Return the standard deviations of vertices, total force and pressure of `result` that the locator's noise causes, and
+        the gauge's noise if its `pressure` was given; NaN where no surface was found.
 
         Raises:
-            MembraneError: the estimator knows none.
+            MembraneError: the estimator does not compute standard deviations.
         """
         expect(isinstance(result, Reconstruction), "standard_deviations: result", type(result).__name__, "a tm.Reconstruction")
         observer, confidence = self.observer, self.observer.sighted(result.confidence)

@@ -1,4 +1,4 @@
-"""The contents of a `state_dict`: camera, material and what follows from it; everything else is rebuilt from the sensor."""
+"""Contents of a `state_dict`: the camera, the material and what depends on them; everything else is rebuilt from the sensor."""
 
 from typing import Any
 
@@ -11,27 +11,27 @@ from .user_warnings import warn_user
 
 OF_MATERIAL = ("prestretch", "c1", "c2", "rest_pressure", "rest_load")
 STIFFNESS, FOLLOWING = ("c1", "c2"), ("rest_pressure", "rest_load")
-"""Entries whose difference shows another sensor, which is refused; entries that follow from the others."""
+"""Entries that identify the sensor, so that a difference is refused, and entries that are derived from the others."""
 IDENTITY = "rest_markers"
 """The markers' rest positions `[D, 3]`: those of another sensor are refused."""
-SAME_MARKERS = 1e-4  # largest distance of rest markers of one sensor, over their extent
+SAME_MARKERS = 1e-4  # largest distance between the rest markers of two states of one sensor, over the markers' extent
 
 
 def drop_derived_buffers(module: nn.Module) -> None:
-    """Leave constants that are rebuilt from the sensor out of a module's state; parameters that were added stay.
+    """Omit the constants that are rebuilt from the sensor from a module's state; parameters that were added are kept.
 
-    States that hold all constants can still be loaded: those are checked for their shapes and left out. A state with another
-    prestretch or camera, which may have been learned, is loaded with a warning.
+    A state that holds all constants can still be loaded: their shapes are checked, and the constants are ignored. A state with
+    another prestretch or camera, which may have been learned, is loaded with a warning.
 
     Raises:
-        MembraneError: later, when a state is loaded that is another sensor's, another material's or another grid's.
+        MembraneError: later, when a loaded state belongs to another sensor, material or grid.
     """
     module.register_state_dict_post_hook(_leave_out)
     module.register_load_state_dict_pre_hook(_complete)
 
 
 def _kept(module: nn.Module) -> set[str]:
-    """Names of the buffers that are kept, each once."""
+    """Return the names of the buffers that are kept, each once."""
     camera = {f"{path}." for path, part in module.named_modules() if isinstance(part, Camera)}
     names = [name for name, _ in module.named_buffers()]
     return {
@@ -49,7 +49,7 @@ def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) ->
 
 
 def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Check a state and add the constants that it lacks, with their present values."""
+    """Check a state and add the missing constants with their present values."""
     kept, others = _kept(module), []
     first = {id(buffer): name for name, buffer in reversed(list(module.named_buffers()))}
     for name, buffer in module.named_buffers(remove_duplicate=False):
@@ -75,7 +75,7 @@ def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
 
 
 def _check_others(names: list[str]) -> None:
-    """Refuse another stiffness, and warn of another prestretch or camera; names of the buffers that differ."""
+    """Given the names of the buffers that differ, refuse another stiffness and warn about another prestretch or camera."""
     last = [name.rpartition(".")[2] for name in names]
     if any(name in STIFFNESS for name in last):
         raise MembraneError(

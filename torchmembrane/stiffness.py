@@ -1,22 +1,23 @@
-"""Whether a membrane is still as stiff as it was calibrated: known loads are compared with the loads found."""
+"""Monitoring of the membrane's stiffness: known loads are compared with the reconstructed ones."""
 
 from collections import deque
 from math import sqrt
 
 LEAST_OFF = 0.05
-"""By how much forces must be off, over the true ones, before a calibration is due."""
+"""Relative force error from which a calibration is due."""
 LEAST_DEVIATION = 0.03
-"""Smallest relative deviation of a comparison: the error of nine in ten forces after one weight (docs/recipes.md)."""
+"""Smallest relative standard deviation of a comparison: nine in ten forces after one weight are within it (docs/recipes.md)."""
 MEMORY = 4
-"""Comparisons that count, the latest."""
+"""Number of most recent comparisons that are used."""
 SURE = 3.0
-"""Standard deviations of their mean."""
+"""Significance of a change, in standard deviations of the mean ratio."""
 
 
 class StiffnessWatch:
-    """Ratios of found to known loads, the latest `MEMORY`; a membrane that has softened gives ratios above 1.
+    """Ratios of reconstructed to known loads, of the latest `MEMORY` comparisons; a membrane that has softened gives ratios
+    above 1.
 
-    A camera sees the membrane's strain, not its modulus: a change of the modulus is noticed only with a known load.
+    A camera measures the membrane's strain, not its modulus: only a known load reveals a change of the modulus.
 
     Example:
         >>> watch = StiffnessWatch()
@@ -30,12 +31,12 @@ class StiffnessWatch:
         self._latest: deque[tuple[float, float]] = deque(maxlen=MEMORY)
 
     def add(self, found: float, known: float, deviation: float = 0.0) -> None:
-        """Add one comparison; `deviation` is the standard deviation of the load found, in its unit."""
+        """Add one comparison; `deviation` is the standard deviation of the reconstructed load, in its unit."""
         self._latest.append((found / known, max(LEAST_DEVIATION, deviation / abs(known))))
 
     @property
     def ratio(self) -> float:
-        """Found over known, the mean of the latest; NaN before there is one."""
+        """Return the mean ratio of reconstructed to known load in the latest comparisons; NaN before there is one."""
         weights = [deviation**-2 for _, deviation in self._latest]
         if not weights:
             return float("nan")
@@ -43,11 +44,11 @@ class StiffnessWatch:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the ratio; infinite before there is one."""
+        """Return the standard deviation of the ratio; infinite before there is a comparison."""
         return 1 / sqrt(sum(deviation**-2 for _, deviation in self._latest)) if self._latest else float("inf")
 
     @property
     def is_due(self) -> bool:
-        """Whether the modulus should be calibrated anew."""
+        """Return whether the modulus should be calibrated again."""
         off = abs(self.ratio - 1)
         return off > LEAST_OFF and off > SURE * self.deviation

@@ -1,4 +1,4 @@
-"""One stream of images: dots are followed from frame to frame, and drift of the rest image is detected."""
+"""Reconstruction of one image stream: dots are followed from frame to frame, and drift of the rest image is detected."""
 
 from math import isfinite
 from typing import Any
@@ -16,38 +16,39 @@ from .stiffness import StiffnessWatch
 from .user_warnings import warn_user
 
 LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE, Status.VIEW_LEFT_OUT)
-"""Statuses of frames that reveal a drift: a camera that moved may leave them unexplained."""
+"""Statuses of frames that are examined for drift: with a moved camera they may be `UNEXPLAINED`."""
 STEADY = 100
-"""Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
+"""Frames for which a contact must have been motionless from the start before it is reported as a possible drift."""
 FOUND_PRESSURE_ERROR = 0.06
-"""Relative error of a pressure change that is found (docs/calibration.md)."""
+"""Relative error of a reconstructed pressure change (docs/calibration.md)."""
 LARGEST_STEADY = 0.3
-"""px, rms: how far such a contact moves the markers at most."""
+"""px, rms: largest displacement of the markers by a contact that is reported as a possible drift."""
 
 
 class Tracker:
     """Reconstructs the frames of one sensor one after another.
 
-    Dots are looked for where the frame before had them, a texture as in a frame alone. All else is as for a frame alone, and so
-    are its answers, to the last digit where the same dots are found: they do not hang on where a stream began. After a frame
-    without a surface the next one is alone.
+    The search for dots starts at their pixels in the preceding frame; texture is searched for as in a single frame. Everything
+    else is the same as for a single frame, and so are the results, to the last digit if the same dots are found: they do not
+    depend on where the stream began. A frame that follows one without a surface is treated as a single frame.
 
-    Frames without contact tell whether the markers still rest where the rest image has them. When they do not, beyond chance,
-    for temperature, creep, swelling, another pressure or a moved camera, the tracker warns once, with the remedy, `rezero`. A
-    slow drift may itself be taken for a contact: frames whose markers hardly leave where they lay without one count as well. So
-    may one from before the stream: a contact from its beginning that is light, moves the markers as a drift does and holds
-    still for `STEADY` frames is said too, as what it may be.
+    Frames without contact show whether the markers still rest where the rest image has them. If they do not, by more than
+    chance, because of temperature, creep, swelling, another pressure or a moved camera, the tracker warns once and recommends
+    `rezero`. A slow drift may itself be mistaken for a contact. Therefore frames whose markers hardly deviate from their
+    positions in earlier frames without contact count as well. A drift from before the stream may also look like a contact: a
+    light contact that exists from the first frame, displaces the markers as a drift does and does not move for `STEADY` frames
+    is reported as a possible drift.
 
     Args:
-        reconstructor: the sensor's.
+        reconstructor: the `Reconstructor` of the sensor.
 
     Attributes:
-        time: time of the latest frame, as it was given; None where it was not.
-        stiffness: what known loads, given by `weigh` and `gauge`, tell of the membrane's modulus.
+        time: time of the latest frame as given by the caller, or None.
+        stiffness: comparisons with known loads, from `weigh` and `gauge`, that monitor the membrane's modulus.
 
     Limitations:
-        A sudden change amid a stream that is taken for a contact is not noticed (see docs/drift.md). A touch too light to be
-        found, or held still from the beginning, may be said to be a drift.
+        A sudden change in the middle of a stream that is mistaken for a contact is not noticed (see docs/drift.md). A touch
+        that is too light to be detected, or motionless from the start, may be reported as a drift.
 
     Example:
         >>> import torchmembrane as tm
@@ -76,17 +77,17 @@ class Tracker:
         self._watch_from(reconstructor.observer.rest_covariance)
 
     def __call__(self, frame: Any, pressure: float | None = None, time: float | None = None) -> Reconstruction:
-        """The frame's result, a batch of one.
+        """Reconstruct the next frame of the stream; the result is a batch of one.
 
         Args:
-            frame: `[H, W]`, `[1 | 3, H, W]` or `[H, W, 1 | 3]`, or a batch of one as for `Reconstructor`; of views that have
-                images of their own a list of these, or `[W, H, W']`.
-            pressure: that a gauge reads, as for `Reconstructor`.
-            time: when the frame was taken, seconds of any clock; kept in `time`, later than that of the frame before.
+            frame: `[H, W]`, `[1 | 3, H, W]` or `[H, W, 1 | 3]`, or a batch of one as for `Reconstructor`; if views have
+                separate images, a list of these, or `[W, H, W']`.
+            pressure: measured pressure, as for `Reconstructor`.
+            time: time of the frame, in seconds of any clock, later than the preceding frame's; kept in `time`.
 
         Raises:
-            MembraneError: more than one frame, another size, shape or type; a time that is no finite number, or not after that
-                of the frame before.
+            MembraneError: there is more than one frame, the size, shape or type is wrong, or the time is not finite or not
+                later than the preceding frame's.
         """
         images = self._one(frame)
         expected = "seconds of any clock, a finite number"
@@ -106,14 +107,14 @@ class Tracker:
 
     @property
     def drift(self) -> float:
-        """How far the markers lie off their rest, px, rms over the markers of their mean displacement in the latest frames
-        without contact as a smooth field, beyond what noise explains; NaN before there are some. A moved camera's motion is
-        in it, as `pixels` have it. Where a contact that holds still is said to be a drift, that one's."""
+        """Return the drift of the markers from rest, px: the rms over the markers of their mean displacement in the latest
+        frames without contact, fitted by a smooth field, beyond what noise explains. It is NaN before there are enough frames,
+        and includes a camera motion, as `pixels` does. If a motionless contact is reported as a drift, it is that contact's."""
         return (self._steady if self._is_steady() else self._watch).drift().size
 
     def warm_up(self) -> None:
-        """Do now what the first frame would wait for: machine code is compiled where there is none yet, which takes a minute or
-        more (`machine_code`). A stream's frames do not wait for it then; what the tracker has seen stays as it was."""
+        """Compile the machine code now, if it is not compiled yet, so that the first frame does not wait for it; this takes a
+        minute or more (`machine_code`). The tracker's state does not change."""
         r = self.reconstructor
         images = [torch.zeros(height, width) for width, height in r.camera.image_sizes if r.sensor.views_apart]
         width, height = r.image_size
@@ -122,21 +123,22 @@ class Tracker:
             r(images or torch.zeros(height, width))
 
     def reset(self) -> None:
-        """Forget the frames before, what `rezero` took for rest, the drift and the time."""
+        """Forget the preceding frames, the rest state set by `rezero`, the drift and the time."""
         self._before = self._latest = self._latest_result = self._rest_pixels = self.time = None
         self._watch_from(self.reconstructor.observer.rest_covariance)
 
     def weigh(self, force: float) -> float:
-        """Compare the latest frame, in which something of known weight stands on the membrane alone, with that weight.
+        """Compare the force in the latest frame, in which only an object of known weight rests on the membrane, with that
+        weight.
 
-        A membrane that softens or stiffens shows in nothing else but this and a gauge (`gauge`). Once the latest comparisons
-        say so for certain, a warning says that a calibration is due.
+        Only this comparison and that of a gauge (`gauge`) reveal that a membrane softens or stiffens. Once the latest
+        comparisons are significant, a warning recommends a calibration.
 
         Args:
             force: the weight, N.
 
         Returns:
-            The force that is found, over the weight.
+            The ratio of the reconstructed force to the weight.
 
         Raises:
             MembraneError: there is no frame, its status is not ok, its contact reaches the rim, which bears a part of the
@@ -153,17 +155,17 @@ class Tracker:
         return self._compared(float(result.force[0].norm()), float(force), deviation if isfinite(deviation) else 0.0)
 
     def gauge(self, pressure_change: float) -> float:
-        """Compare the latest frame, which was taken without a `pressure`, with the change since rest that a gauge reads; as
+        """Compare the latest frame, taken without a `pressure`, with a gauge's pressure change since rest; otherwise as
         `weigh`.
 
         Args:
-            pressure_change: N / length^2, not zero.
+            pressure_change: measured change since rest, N / length^2, not zero.
 
         Returns:
-            The change that is found, over that one.
+            The ratio of the reconstructed to the measured change.
 
         Raises:
-            MembraneError: as of `weigh`, or the change is zero.
+            MembraneError: as for `weigh`, or the change is zero.
         """
         result = self._relied_on("gauge")
         right = is_number(pressure_change) and isfinite(pressure_change) and pressure_change != 0
@@ -189,13 +191,14 @@ class Tracker:
         return found / known
 
     def rezero(self, frame: Any = None) -> None:
-        """Take a frame without contact, default the latest, for the rest state: what drifted since the rest image is nulled.
+        """Use a frame without contact, by default the latest, as the new rest state, which removes the drift since the rest
+        image.
 
-        Markers that are not found in it keep their places in the sensor's rest image. Where a contact is found in the frame, it
-        is taken for rest all the same, as a drift may look like a contact, and a warning says with what force.
+        Markers that are not found in it keep their pixels in the sensor's rest image. If a contact is found in the frame, the
+        frame is used all the same, because a drift may look like a contact, and a warning states the contact's force.
 
         Raises:
-            MembraneError: there is no frame yet, or too few of its markers are found.
+            MembraneError: there is no frame yet, or too few markers are found in it.
         """
         images, result = self._latest, self._latest_result
         if frame is not None:
@@ -212,20 +215,20 @@ class Tracker:
         self._watch_from(rest.covariance)
 
     def _watch_from(self, rest_covariance: Tensor) -> None:
-        """Begin to look for a drift from a rest state with this noise, `[N, 2, 2]` px^2."""
+        """Start the detection of drift from a rest state with this noise, covariance `[N, 2, 2]` px^2."""
         observer = self.reconstructor.observer
         rest, sizes = (observer.rest_pixels, rest_covariance, observer.seen_at_rest), self.reconstructor.camera.image_sizes
         self._watch, self._steady, self._said = DriftWatch(*rest, *sizes), DriftWatch(*rest, *sizes), False
 
     def is_pressed(self, result: Reconstruction) -> bool:
-        """Whether the one frame of a result has a contact that is neither a moved camera's nor a drift that frames without one
-        have shown."""
+        """Return whether a result of one frame shows a contact that neither a moved camera nor a drift, known from frames
+        without contact, explains."""
         moved = self._moved(result)
         touched = bool(result.contact_points.isfinite().any()) and not self._watch.is_rigid(*moved)
         return touched and not self._watch.is_near(*moved)
 
     def _moved(self, result: Reconstruction) -> tuple[Tensor, Tensor]:
-        """How far the markers are off their rest, `[N, 2]` px, and their confidence `[N]`, one view after the other."""
+        """Return the displacements of the markers from rest, `[N, 2]` px, and their confidence `[N]`, view by view."""
         observer = self.reconstructor.observer
         return observer.sighted(result.pixels)[0] - observer.rest_pixels, observer.sighted(result.confidence)[0]
 
@@ -243,13 +246,13 @@ class Tracker:
             warn_user(drift_in_words(self.drift, *self._camera_motion(result), self._is_steady()))
 
     def _is_steady(self) -> bool:
-        """Whether a contact that was there from the beginning has held still, and moves the markers as a drift does."""
+        """Return whether a contact has been motionless from the first frame and displaces the markers as a drift does."""
         found, was_free = self._steady.drift(), self._watch.frames >= FEWEST_FRAMES
         return not was_free and self._steady.frames >= STEADY and found.is_certain and found.size < LARGEST_STEADY
 
     def _camera_motion(self, result: Reconstruction) -> tuple[Tensor | None, str]:
-        """The camera's motion `[4]` in a frame, if that is most of the drift; of several views that of the one whose markers it
-        moves most, and its name."""
+        """Return the camera's motion `[4]` in a frame if it explains most of the drift, else None, and the name of its view. Of
+        several views, the one whose markers move most by it is chosen."""
         r, motion = self.reconstructor, result.camera_motion
         shift = r.camera.shift_of(r.camera.motion_in_pixels(motion), r.observer.rest_pixels)
         shift2 = torch.where(r.observer.seen_at_rest, shift.square().sum(-1), torch.nan)
@@ -263,17 +266,17 @@ class Tracker:
     def _one(self, frame: Any) -> Tensor:
         width, height = self.reconstructor.image_size
         is_colour = not self.reconstructor.sensor.views_apart and np.shape(frame) == (3, height, width)
-        images = self.reconstructor.grey(frame[None] if is_colour else frame)  # of a batch, these would be three grey frames
+        images = self.reconstructor.grey(frame[None] if is_colour else frame)  # a batch of them would be read as three grey frames
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
 
 
 def press_in_words(force: float, unit: str) -> str:
-    """A contact in what is taken for rest, and the remedy.
+    """Return the warning that the new rest frame shows a contact, with the remedy.
 
     Args:
-        force: force of the contact; NaN where it is not known.
+        force: force of the contact, NaN if unknown.
         unit: unit of the force.
     """
     known = f"of {force:.3g} {unit} " if np.isfinite(force) else ""
@@ -284,13 +287,13 @@ def press_in_words(force: float, unit: str) -> str:
 
 
 def drift_in_words(size: float, camera_motion: Tensor | None = None, view: str = "", is_steady: bool = False) -> str:
-    """A drift and its remedy.
+    """Return the warning of a drift, with the remedy.
 
     Args:
-        size: px.
-        camera_motion: du, dv (px), rotation (degrees) and scale, `[4]`, where it is that.
-        view: whose, of several.
-        is_steady: whether it was found in frames with a contact.
+        size: size of the drift, px.
+        camera_motion: du, dv (px), rotation (degrees) and scale, `[4]`, if the camera's motion explains the drift.
+        view: name of the view concerned, if there are several.
+        is_steady: whether the drift was found in frames with a contact.
     """
     camera = ""
     if camera_motion is not None:
@@ -306,7 +309,7 @@ def drift_in_words(size: float, camera_motion: Tensor | None = None, view: str =
 
 
 def stiffness_in_words(watch: StiffnessWatch) -> str:
-    """A changed modulus and its remedy."""
+    """Return the warning of a changed modulus, with the remedy."""
     percent, changed = 100 * abs(watch.ratio - 1), "softened" if watch.ratio > 1 else "stiffened"
     said = "too large" if watch.ratio > 1 else "too small"
     return (

@@ -1,17 +1,17 @@
-"""Warnings that name the line of the caller's program, however deep in this package they arise."""
+"""Warnings that point to the line in the caller's program, however deep in this package they arise."""
 
 import sys
 import warnings
 
 INSIDE = ("torchmembrane", "torch")
-"""Packages whose lines tell a caller nothing."""
+"""Packages whose lines are skipped because they do not help the caller."""
 
 
 def warn_user(message: str) -> None:
-    """Warn at the innermost line outside this package and torch.
+    """Warn with the innermost line outside this package and torch as the location.
 
     Args:
-        message: what happened, and the remedy.
+        message: what happened, and how to correct it.
 
     Example:
         >>> with warnings.catch_warnings(record=True) as said:
