@@ -128,7 +128,7 @@ def unstoppable() -> Iterator[None]:
 
 @contextmanager
 def frame_in_work() -> Iterator[None]:
-    """Mark the computation of frames, which may take longer than `PATIENCE`, so that its end is awaited."""
+    """Mark the computation of frames, which may take longer than `PATIENCE`: a signal in it allows `LONGER`."""
     with _within(_frames):
         yield
 

@@ -46,8 +46,7 @@ class Reconstructor(nn.Module):
         estimator: "force-balance"; "minimum-energy", which finds no tractions and flattens narrow and distant contacts;
             "paper", the paper's linear harmonic method with its contact segmentation; or your own: its registered name,
             "module:Class", or the class.
-        settings: settings of that estimator, an instance of its `Settings`, such as `ForceBalanceSettings`; default:
-            `Settings()`.
+        settings: an instance of that estimator's `Settings`, such as `ForceBalanceSettings`; default: `Settings()`.
         model: elastic energy, "harmonic" | "neo_hookean" | "mooney_rivlin"; default: the sensor's.
         channels: order of the channels of colour images, "rgb" or "bgr".
         dtype: precision of images and results, torch.float32 or torch.float64; slack sheets are always solved in float64.
@@ -146,9 +145,8 @@ class Reconstructor(nn.Module):
 
     @check_arguments
     def read(self, *paths: str | Path) -> Tensor:
-        """Read one or more image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its
-        device. If views have separate images, pass the first view's, NAME_VIEW; the others lie beside them. Unreadable files
-        become NaN."""
+        """Read image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device. If views
+        have separate images, pass the first view's, NAME_VIEW; the others lie beside it, and an unreadable one becomes NaN."""
         expect(len(paths) > 0, "Reconstructor.read: paths", list(paths), "one image file or more")
         if self.sensor.views_apart:
             return torch.cat([read_views(Path(path), self.sensor.views, self.rest_pixels).grey for path in paths])
@@ -166,15 +164,11 @@ class Reconstructor(nn.Module):
 
         Args:
             images: torch or numpy, uint8, uint16 or float in 0..1: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or
-                `[B, H, W, 1 | 3]`; for W views a list of W of these, with None for a missing image. Colours are converted to
-                grey by 0.299 R + 0.587 G + 0.114 B.
-            previous: results of the preceding frames, from which the search for dots starts; texture is always searched for
-                from rest.
-            rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: those in the sensor's rest
-                image.
+                `[B, H, W, 1 | 3]`; for W views a list of W of these, None if missing. Grey is 0.299 R + 0.587 G + 0.114 B.
+            previous: results of the preceding frames, where the search for dots starts; that for texture starts from rest.
+            rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: those in the rest image.
             pressure: `[B]` or a number, measured pressure difference across the membrane in the result's unit, NaN where not
-                measured (force balance only; see `pressure_noise` in its settings). If your gauge measures the change since
-                rest, add `rest_pressure`.
+                measured (force balance only; noise: `pressure_noise`). To a measured change since rest, add `rest_pressure`.
 
         Returns:
             A `Reconstruction`. A frame that cannot be reconstructed gets a status and NaN; the others are not affected.
@@ -218,14 +212,11 @@ class Reconstructor(nn.Module):
         """Reconstruct from marker centres located elsewhere; those that contradict their neighbours get confidence 0.
 
         Args:
-            pixels: `[B, D, 2]` or `[D, 2]` px in the order of the sensor file, NaN for lost markers; for W views `[B, W, D,
-                2]`.
+            pixels: `[B, D, 2]` or `[D, 2]` in the order of the sensor file, NaN for lost markers; for W views `[B, W, D, 2]`.
             confidence: `[B, D]` or `[D]` in 0..1, for W views `[B, W, D]`; default: 1 where the pixels are finite.
-            rest_pixels: `[D, 2]`, for W views `[W, D, 2]`, the same markers in the rest image; default: the model's rest
-                pixels.
+            rest_pixels: `[D, 2]`, for W views `[W, D, 2]`, the same markers at rest; default: the model's rest pixels.
             pressure: measured pressure, as for `forward`.
-            noise: standard deviation of a marker's u and v, px; default: 0.05 for these pixels, the rest image's for those at
-                rest.
+            noise: standard deviation of a marker's u and v, px; default: 0.05, and at rest that of the rest image.
 
         Raises:
             MembraneError: the shape is wrong, or a confidence lies outside 0..1.
@@ -248,8 +239,8 @@ class Reconstructor(nn.Module):
 
     @traced
     def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
-        """Return the estimator's input, from the markers' displacements `[B, D, 2]` px, confidence `[B, D]` and covariance `[B,
-        D, 2, 2]` px^2; default: twice the covariance of the markers in the rest image."""
+        """Return the estimator's input, from the markers' displacements `[B, D, 2]` px, confidence `[B, D]` and covariance
+        `[B, D, 2, 2]` px^2; default: twice the covariance of the markers in the rest image."""
         covariance = 2 * self.observer.rest_covariance if covariance is None else covariance
         found = (confidence > 0).to(confidence.dtype)
         square = (found * displacement.square().sum(-1)).sum(-1) / found.sum(-1).clamp_min(1)

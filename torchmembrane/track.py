@@ -266,7 +266,7 @@ class Tracker:
     def _one(self, frame: Any) -> Tensor:
         width, height = self.reconstructor.image_size
         is_colour = not self.reconstructor.sensor.views_apart and np.shape(frame) == (3, height, width)
-        images = self.reconstructor.grey(frame[None] if is_colour else frame)  # a batch of them would be read as three grey frames
+        images = self.reconstructor.grey(frame[None] if is_colour else frame)  # else read as three grey frames
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
