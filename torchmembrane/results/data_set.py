@@ -1,4 +1,4 @@
-"""A folder of results exported as a data set in the layout of Hugging Face's `datasets`: frames, images, and a card."""
+"""Export of a folder of results in the layout of Hugging Face's `datasets`: frames, images, and a data set card."""
 
 import os
 import shutil
@@ -28,7 +28,7 @@ UNITS = {
     **{"wrench": "{force}, {force} {length}", "contact_area": "{length}^2", "contact_curvature": "1/{length}"},
     **{"pixels": "px", "residual": "px", "camera_motion": "px, px, degrees, 1"},
 }
-"""Units of the arrays of a frame that have one."""
+"""Units of a frame's arrays, where they have one."""
 
 CARD = """\
 ---
@@ -63,23 +63,23 @@ A frame without a surface is NaN, and its status says why.
 {statuses}
 """
 FRAMES, IMAGES_OF = "train/metadata.parquet", "train"
-"""Where the frames are, and their images beside them: `datasets` calls the first of a data set's splits `train`."""
+"""Folder of the frames and their images: `datasets` names the first split of a data set `train`."""
 
 
 def write_data_set(results: Results, folder: Path, images: Mapping[str, Path], times: Mapping[str, float]) -> None:
-    """Write a folder that `datasets.load_dataset(FOLDER)` loads: a row for each frame, images where there are some.
+    """Write a folder that `datasets.load_dataset(FOLDER)` loads, with one row for each frame, and images if there are any.
 
-    `README.md` is the card, with the sensor, its record, units and statuses; `train/metadata.parquet` has `name`, `time`,
-    `status_text` and all arrays of a frame; the images lie beside it; `mesh.npz` is what the frames share.
+    `README.md` is the card, with the sensor, its record, units and statuses; `train/metadata.parquet` contains `name`, `time`,
+    `status_text` and all arrays of each frame, with the images beside it; `mesh.npz` contains what the frames share.
 
     Args:
-        results: the frames.
-        folder: the folder to be made; it must not exist.
-        images: files by name, of all frames or of none.
-        times: times of capture, seconds since 1970, by name; may be empty.
+        results: the frames to export.
+        folder: the folder to create; it must not exist.
+        images: image files by frame name, of all frames or of none.
+        times: times of capture by frame name, seconds since 1970; may be empty.
 
     Raises:
-        MembraneError: PyArrow is not installed, there is something at `folder`, or some frames have an image and others none.
+        MembraneError: PyArrow is not installed, `folder` exists, or only some of the frames have an image.
     """
     if os.path.lexists(folder):
         raise MembraneError(f"{folder}: exists already; expected the folder of a new data set")
@@ -101,7 +101,7 @@ def write_data_set(results: Results, folder: Path, images: Mapping[str, Path], t
 
 
 def _write_frames(results: Results, path: Path, files: Mapping[str, str], times: Mapping[str, float]) -> Counter[Status]:
-    """The frames as rows; how many there are of each status."""
+    """Write the frames as rows, and return the number of frames by status."""
     arrow, parquet = load_pyarrow()
     counts, writer = Counter[Status](), None
     for names, frames in _groups(results):
@@ -127,10 +127,10 @@ def _groups(results: Results) -> Iterator[tuple[list[str], list[dict[str, np.nda
 
 
 def card(mesh: Mesh, name: str, counts: Mapping[Status, int], has_images: bool) -> str:
-    """The data set's `README.md`.
+    """Return the text of the data set's `README.md`.
 
     Args:
-        mesh: what its frames share.
+        mesh: the data that the frames share.
         name: name of the data set.
         counts: numbers of frames by status.
         has_images: whether there are images.

@@ -1,4 +1,4 @@
-"""The shapes of a frame's arrays: `V` vertices, `D` markers, `P` contact patches, `W` views where there are several."""
+"""The shapes of a frame's arrays: `V` vertices, `D` markers, `P` contact patches and, with several views, `W` views."""
 
 from collections.abc import Mapping
 
@@ -15,13 +15,13 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
 }
 
 FIELDS: dict[str, tuple[str | int, ...]] = {"stretch": ("V", 2), "tension": ("V", 2)}
-"""Shapes of arrays that a frame contains on request: principal values, those of the larger stretch first."""
+"""Shapes of optional arrays of a frame: principal values, those of the larger stretch first."""
 OF_EACH_VIEW = ("pixels", "confidence", "residual", "camera_motion")
 """Arrays that begin with an axis `W` if there are several views."""
 
 
 def shape_of(key: str, sizes: Mapping[str, int]) -> tuple[int, ...]:
-    """The shape of an array for given numbers of vertices, markers and patches, and of views, `W`, if there are several.
+    """Return the shape of an array for given numbers of vertices, markers and patches, and of several views, `W`.
 
     Example:
         >>> shape_of("contact_force", {"P": 4})
@@ -32,7 +32,7 @@ def shape_of(key: str, sizes: Mapping[str, int]) -> tuple[int, ...]:
 
 
 def of_first_view(frame: Mapping[str, np.ndarray], key: str) -> np.ndarray:
-    """An array of a frame; of several views the first one's.
+    """Return an array of a frame; with several views, the first view's part of it.
 
     Example:
         >>> of_first_view({"residual": np.array([0.1, 0.2])}, "residual").item()
@@ -44,8 +44,8 @@ def of_first_view(frame: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def shape_mismatch(frame: Mapping[str, np.ndarray], vertices: int, markers: int, views: int = 0) -> str:
-    """The first array of a frame whose shape does not fit these numbers of vertices and markers; "" if all fit. `views`: 0 of a
-    sensor with one view.
+    """Describe the first array of a frame whose shape does not fit these numbers of vertices and markers; "" if all fit. For a
+    sensor with one view, `views` is 0.
 
     Example:
         >>> shape_mismatch({key: np.zeros(shape_of(key, {"V": 9, "D": 2, "P": 4})) for key in SHAPES}, 9, 3)

@@ -1,4 +1,4 @@
-"""Which frames of a batch are solved."""
+"""Selection of the frames of a batch that are solved."""
 
 import torch
 from torch import Tensor
@@ -7,19 +7,19 @@ from .status import Status
 
 
 def is_seen(status: Tensor) -> Tensor:
-    """Which frames, `[B]` bool of statuses `[B]` before the solve, are solved: by all views, or by those not left out."""
+    """Return which frames are solved, `[B]` bool, from their statuses `[B]` before the solve; a view may have been left out."""
     return (status == Status.OK.value) | (status == Status.VIEW_LEFT_OUT.value)
 
 
 def broken_down(status: Tensor, vertices: Tensor) -> Tensor | None:
-    """Statuses `[B]` with the frames whose solve broke down said; None where none did, or no gradient is asked for.
+    """Return the statuses `[B]` with failed solves marked, or None if no solve failed or no gradient is recorded.
 
-    A broken solve passes NaN to all that its gradient reaches, also what the batch's other frames share with it: so it is not
-    the one to be differentiated.
+    A failed solve passes NaN to everything that its gradient reaches, including what it shares with the other frames of the
+    batch; therefore the batch must be solved again without it before it is differentiated.
 
     Args:
-        status: `[B]`, before the solve.
-        vertices: `[B, V, 3]` that it found.
+        status: statuses before the solve, `[B]`.
+        vertices: the solution, `[B, V, 3]`.
     """
     if torch.compiler.is_compiling() or not isinstance(vertices, Tensor) or not vertices.requires_grad:
         return None

@@ -1,5 +1,5 @@
-"""The frames of a folder of results as rows of one Parquet dataset: small parts are written during the job and merged into
-large ones."""
+"""Storage of the frames of a folder of results as rows of one Parquet dataset: small parts are written during the job and
+merged into large ones."""
 
 import json
 import re
@@ -23,11 +23,11 @@ from .status import Status
 from .store import Mesh
 
 PART_ROWS = 256
-"""Frames of one Parquet file, at least, once there are as many."""
+"""Number of frames from which a part is complete."""
 PART_BYTES = 2**27
-"""Approximate size of the arrays of such a file; with large surfaces a file holds fewer frames."""
+"""Approximate size of the arrays of a complete part; with large surfaces a part contains fewer frames."""
 SAVE_SECONDS = 5.0
-"""Frames are held back for this long at most."""
+"""Longest time for which frames are buffered, s."""
 PART = re.compile(r"part-\d+")
 A_PART = "a part of torchmembrane's results"
 AS_WRITTEN = "it as it was written: the same reconstruct command again sets it aside and does its frames again"
@@ -35,19 +35,19 @@ COLUMNS = ("name", "status_text", *SourceFile._fields, "seconds", *Reconstructio
 
 
 class FrameTable:
-    """Frames as rows of `part-*.parquet`: name, status in words, the file that they are of, and the keys of `Reconstruction`,
-    arrays as nested lists of fixed sizes.
+    """Frames as rows of `part-*.parquet`: name, status text, source file, and the fields of `Reconstruction`, whose arrays are
+    nested lists of fixed sizes.
 
-    The schema's metadata hold the shapes (`shapes`, JSON: key to shape), units and the sensor's fingerprint. Rows are held
-    back for `SAVE_SECONDS`, or until `PART_ROWS` of them make a file.
+    The schema's metadata contain the shapes (`shapes`, a JSON object), the units and the sensor's fingerprint. Rows are
+    buffered for `SAVE_SECONDS`, or until `PART_ROWS` of them fill a part.
 
     Args:
         folder: folder of the parts.
-        mesh: what the frames share.
-        write_lock: held while parts are changed.
+        mesh: the data that the frames share.
+        write_lock: lock that is held while parts are changed.
 
     Attributes:
-        damaged: parts that could not be read, as far as `stored` has come; they were renamed.
+        damaged: unreadable parts that `stored` has encountered so far; they were renamed.
     """
 
     def __init__(self, folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any]):
@@ -61,13 +61,13 @@ class FrameTable:
         self._saved = time.monotonic()
 
     def names(self) -> set[str]:
-        """The names of all frames, stored or buffered."""
+        """Return the names of all frames, stored or buffered."""
         return set().union(self._waiting, *self._index().values())
 
     def stored(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Stored]]:
-        """All frames with the wanted names.
+        """Yield all frames whose names are wanted.
 
-        Parts are repaired on the way: unreadable ones are renamed to `*.damaged`, duplicate rows left by an interrupted merge
+        Parts are repaired in passing: unreadable ones are renamed to `*.damaged`, duplicate rows left by an interrupted merge
         are removed, and parts of earlier versions are rewritten.
         """
         with self.write_lock:
@@ -93,7 +93,7 @@ class FrameTable:
                 yield from ((name, stored) for name, stored in once.items() if wanted(name))
 
     def read(self, names: Iterable[str]) -> list[Frame]:
-        """The frames of these names, in their order; each part that holds one is read once."""
+        """Return the frames with these names, in the same order; each part that contains one is read once."""
         names, found = list(names), {name: stored.frame for name, stored in self._waiting.items()}
         for part, held in self._index().items():
             if not held.isdisjoint(names):
@@ -104,19 +104,19 @@ class FrameTable:
         return [found[name] for name in names]
 
     def write(self, name: str, stored: Stored) -> None:
-        """Buffer a frame until there are `PART_ROWS` of them, or until `save` finds that it is time."""
+        """Buffer a frame until there are `PART_ROWS` of them, or until `save` writes them."""
         self._waiting[name] = stored
         if len(self._waiting) >= self.part_rows:
             self._flush()
 
     def forget(self, name: str) -> None:
-        """Remove a frame, if it is there."""
+        """Remove a frame, if it exists."""
         self._waiting.pop(name, None)
         with self.write_lock:
             self._drop([name])
 
     def save(self) -> None:
-        """Write the buffered frames, if the last write was `SAVE_SECONDS` ago."""
+        """Write the buffered frames if the last write was at least `SAVE_SECONDS` ago."""
         if time.monotonic() - self._saved >= SAVE_SECONDS:
             self._flush()
 
@@ -139,8 +139,8 @@ class FrameTable:
             self._merge(least=self.part_rows)
 
     def _merge(self, least: int) -> None:
-        """Small parts become one where they have `least` rows together. The first of them is replaced, the others are deleted:
-        interrupted in between, rows are there twice until the folder is opened again."""
+        """Merge small parts into one if they have at least `least` rows together. The first of them is replaced and the others
+        are deleted; if this is interrupted, some rows exist twice until the folder is opened again."""
         group: dict[Path, int] = {}
         for part, held in self._index().items():
             if len(held) < self.part_rows:
@@ -172,7 +172,7 @@ class FrameTable:
         return sorted((path for path in self.folder.glob("part-*.parquet") if PART.fullmatch(path.stem)), key=in_order)
 
     def _index(self) -> dict[Path, frozenset[str]]:
-        """The names in each part; those of parts that have not changed are not read again."""
+        """Return the names in each part; parts that have not changed are not read again."""
         try:
             versions = {part: _version(part) for part in self._parts()}
             for part, version in versions.items():
@@ -200,10 +200,10 @@ class FrameTable:
 
 
 def read_part(part: Path) -> dict[str, Frame]:
-    """The frames of one part by name.
+    """Return the frames of one part by name.
 
     Raises:
-        MembraneError: it is not one, or damaged.
+        MembraneError: the file is not a part, or damaged.
     """
     table = _table(part)
     try:
@@ -217,10 +217,10 @@ def _table(part: Path, columns: list[str] | None = None) -> Any:
 
 
 def _version(part: Path) -> tuple[int, int]:
-    """A value that changes when a part is replaced.
+    """Return a value that changes when a part is replaced.
 
     Raises:
-        FileNotFoundError: it is not there any more.
+        FileNotFoundError: the part does not exist any more.
     """
     try:
         stat = part.stat()

@@ -1,4 +1,4 @@
-"""The frames of a folder of results, each in its own NAME.npz or as a row of one Parquet dataset; both have one interface."""
+"""The frames of a folder of results, stored as one NAME.npz each or as rows of one Parquet dataset, with one interface."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -19,15 +19,15 @@ Frames: TypeAlias = "FrameFiles | FrameTable"
 
 
 def open_folder(folder: str | Path, mesh: Mesh, write_lock: AbstractContextManager[Any]) -> Frames:
-    """Open the frames of a folder for writing; the folder is made if it does not exist.
+    """Open the frames of a folder for writing; the folder is created if it does not exist.
 
     Args:
         folder: folder of the results.
-        mesh: what they share.
-        write_lock: a lock that is held while files are changed that other processes change as well.
+        mesh: the data that the frames share.
+        write_lock: lock that is held while files are changed that other processes change as well.
 
     Raises:
-        MembraneError: what `check_folder` refuses.
+        MembraneError: `check_folder` refuses the folder.
     """
     folder = Path(folder)
     with write_lock:
@@ -38,18 +38,18 @@ def open_folder(folder: str | Path, mesh: Mesh, write_lock: AbstractContextManag
 
 
 def frames_of(folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any] | None = None) -> Frames:
-    """The frames of a folder whose mesh this is."""
+    """Return the frames of the folder to which this mesh belongs."""
     if mesh.format == "parquet":
         return FrameTable(folder / "frames", mesh, write_lock or nullcontext())
     return FrameFiles(folder, mesh)
 
 
 class FrameFiles:
-    """Frames as one NAME.npz each: the keys of `Reconstruction`, and of `Stored`.
+    """Frames stored as one NAME.npz each, with the fields of `Reconstruction` and of `Stored`.
 
     Args:
         folder: folder of the files.
-        mesh: what the frames share.
+        mesh: the data that the frames share.
 
     Attributes:
         damaged: files that the latest call of `names` or `stored` could not read.
@@ -60,12 +60,12 @@ class FrameFiles:
         self.damaged: list[Path] = []
 
     def names(self) -> set[str]:
-        """The names of all stored frames, including damaged ones; files with other arrays are left out."""
+        """Return the names of all stored frames, including damaged ones; files with other arrays are ignored."""
         self.damaged = []
         return {path.stem for path in self._files() if self._is_result(path)}
 
     def stored(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Stored]]:
-        """All frames with the wanted names; `damaged` then lists those that could not be read."""
+        """Yield all frames whose names are wanted; afterwards `damaged` lists those that could not be read."""
         self.damaged = []
         for path in self._files():
             if wanted(path.stem):
@@ -78,11 +78,11 @@ class FrameFiles:
                 yield path.stem, stored
 
     def read(self, names: Iterable[str]) -> list[Frame]:
-        """The frames of these names, in their order."""
+        """Return the frames with these names, in the same order."""
         return [load_frame(self._path(name)) for name in names]
 
     def write(self, name: str, stored: Stored) -> None:
-        """Store a frame and replace an earlier one of the same name; a file of that name that is not a frame is renamed."""
+        """Store a frame, replacing one of the same name; a file of that name that is not a frame is renamed."""
         path = self._path(name)
         if path in self.damaged:
             path.replace(path.with_suffix(".damaged"))
@@ -90,15 +90,15 @@ class FrameFiles:
         save_frame(path, stored.arrays())
 
     def forget(self, name: str) -> None:
-        """Remove a frame, if it is there."""
+        """Remove a frame, if it exists."""
         if os.path.exists(self._path(name)):
             self._path(name).unlink()
 
     def save(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: frames are not buffered."""
 
     def close(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: frames are not buffered."""
 
     def _files(self) -> list[Path]:
         return sorted(path for path in self.folder.glob("*.npz") if path.name != MESH and not is_of_system(path))

@@ -1,4 +1,4 @@
-"""One frame as a file NAME.npz: its arrays, its source image, and the time that it took."""
+"""One frame as a file NAME.npz: its arrays, its source image, and its computation time."""
 
 from io import BytesIO
 from pathlib import Path
@@ -19,17 +19,17 @@ ADDED = (
     *("wrench", "contact_force", "contact_normal", "contact_area", "contact_slip", "contact_curvature", "contact_at_rim"),
     *("coverage", "camera_motion", "force_deviation", "depth_deviation"),
 )
-"""Arrays that results did not always hold."""
+"""Arrays that results of earlier versions lack."""
 EXPECTED = "a result NAME.npz, the arrays of Reconstruction"
 
 
 class Stored(NamedTuple):
-    """A frame as it is stored: its arrays, its source image, and the time that it took.
+    """A stored frame: its arrays, its source image, and its computation time.
 
     Attributes:
-        frame: as for `Reconstruction.frame` gives it.
-        origin: the image file, or the video.
-        seconds: NaN where it is not known.
+        frame: arrays as returned by `Reconstruction.frame`.
+        origin: the image file or the video.
+        seconds: computation time, s; NaN if unknown.
     """
 
     frame: Frame
@@ -38,10 +38,10 @@ class Stored(NamedTuple):
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, Any]) -> "Stored":
-        """A frame from all arrays of a file; what the file lacks is taken as unknown.
+        """Return the frame that a file's arrays describe; values that the file lacks are unknown.
 
         Raises:
-            KeyError: it lacks one that there always was.
+            KeyError: an array is missing that all versions have written.
         """
         known = {key: arrays[key] for key in SourceFile._fields if key in arrays}
         origin = SourceFile()._replace(
@@ -50,7 +50,7 @@ class Stored(NamedTuple):
         return cls(completed(arrays), origin, float(arrays.get("seconds", np.nan)))
 
     def arrays(self) -> Frame:
-        """All arrays of a file, by name."""
+        """Return all arrays of the file, by name."""
         known = {key: np.asarray(value) for key, value in self.origin._asdict().items()}
         return self.frame | known | {"seconds": np.asarray(self.seconds, np.float64)}
 
@@ -59,8 +59,8 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     """Write one frame atomically.
 
     Args:
-        path: the file, `.npz`.
-        frame: as for `Reconstruction.frame` gives it.
+        path: path of the file, `.npz`.
+        frame: arrays as returned by `Reconstruction.frame`.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -71,7 +71,7 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
         [1.0, 1.0, 1.0]
     """
     arrays: dict[str, Any] = frame
-    content = BytesIO()  # written at once: each write of a file makes other threads wait for their turn
+    content = BytesIO()  # written in one call: each write of a file makes other threads wait for their turn
     try:
         np.savez(content, **arrays)
     except ValueError as error:
@@ -85,13 +85,13 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
     """Read a frame.
 
     Args:
-        path: what `save_frame` wrote.
+        path: a file written by `save_frame`.
 
     Returns:
-        Its arrays by name; see `save_frame` for an example.
+        The frame's arrays by name; see `save_frame` for an example.
 
     Raises:
-        MembraneError: the file is missing, or not a frame.
+        MembraneError: the file is missing, or is not a frame.
     """
     return load_stored(Path(path)).frame
 
@@ -110,11 +110,11 @@ def load_stored(path: Path) -> Stored:
 
 
 def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """A frame of an earlier version with the arrays that it lacks filled with NaN.
+    """Fill the arrays that a frame of an earlier version lacks with NaN.
 
     Raises:
-        KeyError: it lacks one that there always was.
-        MembraneError: a status that this version does not know.
+        KeyError: an array is missing that all versions have written.
+        MembraneError: this version does not know the status.
     """
     if unknown := set(np.ravel(frame["status"]).tolist()) - set(Status):
         known = f"one from {min(Status):d} to {max(Status):d}"
@@ -126,13 +126,13 @@ def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
-    """Frames of one sensor as a batch.
+    """Stack frames of one sensor to a batch.
 
     Args:
-        frames: as for `Reconstruction.frame` gives them.
+        frames: frames as returned by `Reconstruction.frame`.
 
     Returns:
-        The batch, in their order, on the CPU.
+        The batch on the CPU, in the order of the frames.
 
     Example:
         >>> first, second = (Reconstruction(*torch.full((26, 1, 3), value)).frame(0) for value in (1.0, 2.0))

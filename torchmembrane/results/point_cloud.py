@@ -1,4 +1,4 @@
-"""The contact of a frame as a point cloud."""
+"""Export of a frame's contact as a point cloud."""
 
 from pathlib import Path
 
@@ -8,15 +8,15 @@ from ..files.atomic import write_text
 from .reconstruction import Frame
 
 TOUCHED = 0.5
-"""Least `contact` of a vertex in a contact's point cloud."""
+"""Smallest `contact` of a vertex in the point cloud."""
 
 
 def save_contact_cloud(path: str | Path, frame: Frame) -> int:
-    """Write the vertices that something touches as a point cloud, with their normals and tractions.
+    """Write the vertices in contact as a point cloud with normals and tractions.
 
     Args:
-        path: the file, `.ply` (ASCII), written atomically.
-        frame: as for `Reconstruction.frame` gives it.
+        path: path of the file, `.ply` (ASCII), written atomically.
+        frame: arrays as returned by `Reconstruction.frame`.
 
     Returns:
         The number of points, those with `contact` above 0.5; 0 without a contact.

@@ -1,4 +1,4 @@
-"""Results read back: a folder of `torchmembrane reconstruct` as a sequence of frames that are loaded one by one."""
+"""Access to stored results: a folder of `torchmembrane reconstruct` as a sequence of frames that are loaded on demand."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -20,24 +20,23 @@ AGAIN = "run the same reconstruct command again, which does its frame again, or 
 
 @check_arguments
 def read_results(folder: str | Path) -> "Results":
-    """The results in a folder, of either format.
+    """Open the results in a folder, in either format.
 
-    Only names and `mesh.npz` are read now; frames are read where they are asked for. Frames that failed are among them, NaN,
-    with their status; images that could not be read have no frame (`summary.csv` lists them). Frames that are written to the
-    folder later are not included. Damaged results are named in a warning; they are among the frames, and reading one of them is
-    an error.
+    Only the names and `mesh.npz` are read at first; frames are read on access. Failed frames are included, with NaN and their
+    status; images that could not be read have no frame (`summary.csv` lists them). Frames that are written to the folder later
+    are not included. A warning names damaged results; they are included, and reading one of them raises an error.
 
     Args:
-        folder: what `torchmembrane reconstruct --out` was given.
+        folder: the folder given to `torchmembrane reconstruct --out`.
 
     Returns:
         The frames, in name order.
 
     Raises:
-        MembraneError: the folder holds no results, or not one frame.
+        MembraneError: the folder contains no results, or no frame.
 
     Example:
-        Here the folder is written by hand, of a surface without vertices; `torchmembrane reconstruct` writes such folders.
+        Here the folder is written by hand, for a surface without vertices; `torchmembrane reconstruct` writes such folders.
 
         >>> import numpy as np, tempfile
         >>> from torchmembrane.results.frame_shapes import SHAPES, shape_of
@@ -58,7 +57,7 @@ def read_results(folder: str | Path) -> "Results":
 
 
 class FoundFrame(NamedTuple):
-    """A frame that was asked for, and the folder in which its `mesh.npz` should be."""
+    """A requested frame, and the folder that should contain its `mesh.npz`."""
 
     name: str
     frame: Frame
@@ -67,14 +66,14 @@ class FoundFrame(NamedTuple):
 
 @check_arguments
 def read_frame(path: str | Path, name: str | None = None) -> FoundFrame:
-    """One frame of whatever holds results.
+    """Read one frame from a file or a folder of results.
 
     Args:
         path: NAME.npz, a part of a Parquet dataset, or a folder of results.
         name: name of the frame in a part or a folder; default: the first.
 
     Raises:
-        MembraneError: it holds no results, or none of this name.
+        MembraneError: the path contains no results, or no frame of this name.
     """
     path = Path(path)
     if path.is_dir():
@@ -95,21 +94,21 @@ def read_frame(path: str | Path, name: str | None = None) -> FoundFrame:
 class Results:
     """The frames of a folder of results: a sequence in name order, and a mapping by name.
 
-    `len(results)` frames; `for frame in results` gives each as a dict of arrays (`Reconstruction.frame`), in the order of
-    `results.names`; `results["press"]` gives one, `"press" in results` asks for it. Frames are read from disk each time and not
-    kept: iterating over a folder of any size takes little memory, and over a Parquet dataset it is faster than asking by name,
-    which reads a part of the dataset each time.
+    `len(results)` is the number of frames. `for frame in results` yields each as a dict of arrays (`Reconstruction.frame`), in
+    the order of `results.names`; `results["press"]` returns one, and `"press" in results` tests for it. Frames are read from
+    disk on each access and not kept, so that iteration over a folder of any size needs little memory. For a Parquet dataset,
+    iteration is faster than access by name, which reads a part of the dataset each time.
 
     Args:
         folder: the folder of results.
 
     Attributes:
-        folder: the same.
-        mesh: what all frames share: rest surface, triangles, units, settings.
-        names: names of all frames, in order: numbers within them count as numbers.
+        folder: the folder of results.
+        mesh: the data that all frames share: rest surface, triangles, units, settings.
+        names: names of all frames, in natural order: numbers within them are compared as numbers.
 
     Raises:
-        MembraneError: the folder holds no results, or not one frame.
+        MembraneError: the folder contains no results, or no frame.
     """
 
     def __init__(self, folder: Path):
@@ -150,18 +149,18 @@ class Results:
         return f"Results({str(self.folder)!r}: {len(self)} frames of {self.mesh.name!r})"
 
     def batch(self) -> Reconstruction:
-        """All frames as one batch of tensors on the CPU, in the order of `names`.
+        """Load all frames as one batch of tensors on the CPU, in the order of `names`.
 
         Returns:
-            A `Reconstruction` whose tensors have `len(self)` rows. All frames are in memory at once.
+            A `Reconstruction` whose tensors have `len(self)` rows; all frames are in memory at once.
         """
         return stack_frames(list(self))
 
     def to_pandas(self) -> Any:
-        """The frames' single numbers (pressure, residual, status ...) as a table.
+        """Return the frames' scalars (pressure, residual, status ...) as a table.
 
         Returns:
-            A `pandas.DataFrame`: one row per frame, the names as its index, one column per array that holds one number.
+            A `pandas.DataFrame` with one row per frame, indexed by name, and one column per scalar field.
 
         Raises:
             MembraneError: pandas is not installed (extra `pandas`).

@@ -1,4 +1,4 @@
-"""The schema of results."""
+"""The fields of a reconstruction."""
 
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
@@ -10,11 +10,11 @@ from ..errors import MembraneError, expect, is_number
 from ..pose import Pose
 
 Frame: TypeAlias = dict[str, np.ndarray]
-"""One frame's arrays, as `Reconstruction.frame` gives them."""
+"""The arrays of one frame, as returned by `Reconstruction.frame`."""
 
 
 class RestSurface(Protocol):
-    """A rest surface, such as `sensor.membrane`: outward normals `[V, 3]`, areas `[V]` of the vertices, the grid's lines."""
+    """A rest surface, such as `sensor.membrane`: outward normals `[V, 3]`, vertex areas `[V]`, and the lines of the grid."""
 
     @property
     def rest_normals(self) -> Tensor: ...
@@ -25,7 +25,7 @@ class RestSurface(Protocol):
 
 
 class TactileFields(NamedTuple):
-    """What a visuotactile sensor of Isaac Lab gives, under its names; the points are the vertices.
+    """The output of a visuotactile sensor of Isaac Lab, under its names; the points are the vertices.
 
     penetration_depth      [B, V]     `indentation`, zero where the membrane is not pushed in
     tactile_normal_force   [B, V]     compressive force on a vertex
@@ -101,10 +101,10 @@ class Reconstruction(NamedTuple):
     depth_deviation: Tensor
 
     def frame(self, index: int) -> dict[str, np.ndarray]:
-        """One frame as numpy arrays, float32 (status int32), by the names above.
+        """Return one frame as numpy arrays by field name, float32 (status int32).
 
         Raises:
-            MembraneError: there is no such frame.
+            MembraneError: the index is out of range.
 
         Example:
             >>> batch = Reconstruction(*torch.zeros(26, 2, 3))  # two frames; arrays of other shapes in a real one
@@ -119,22 +119,24 @@ class Reconstruction(NamedTuple):
         return {key: value.astype(np.int32 if key == "status" else np.float32) for key, value in arrays.items()}
 
     def split_traction(self) -> tuple[Tensor, Tensor]:
-        """The push `[B, V]`, compressive normal traction, and the shear `[B, V, 3]`: `traction = shear - push normals`."""
+        """Return the push `[B, V]`, the compressive normal traction, and the shear `[B, V, 3]`:
+        `traction = shear - push normals`."""
         push = -(self.traction * self.normals).sum(-1)
         return push, self.traction + push[..., None] * self.normals
 
     def indentation(self, rest: RestSurface) -> Tensor:
-        """How far the vertices have moved along the inward rest normals, `-displacement . rest_normals`: `[B, m, n]`, length.
+        """Return the displacement of the vertices along the inward rest normals, `-displacement . rest_normals`: `[B, m, n]`,
+        length.
 
         Args:
             rest: the sensor's `membrane`, on the grid of this result.
 
         Raises:
-            MembraneError: it has another number of vertices.
+            MembraneError: the number of vertices differs.
 
         Limitations:
-            Not the depth of an object below the rest surface: where the membrane slides along itself, or bulges beside a
-            contact (negative), it moves without one.
+            This is not the depth of an object below the rest surface: vertices also move where the membrane slides along
+            itself, or bulges beside a contact (negative values).
         """
         expect(hasattr(rest, "rest_normals"), "Reconstruction: rest", rest, "the sensor's `membrane`, on this result's grid")
         count, expected = len(rest.rest_normals), self.displacement.shape[-2]
@@ -144,16 +146,17 @@ class Reconstruction(NamedTuple):
         return depth
 
     def tactile_fields(self, rest: RestSurface) -> TactileFields:
-        """Depths and forces of the vertices as Isaac Lab names them.
+        """Return depths and forces at the vertices under the names of Isaac Lab.
 
         Args:
             rest: the sensor's `membrane`, on the grid of this result.
 
         Raises:
-            MembraneError: it has another number of vertices.
+            MembraneError: the number of vertices differs.
 
         Limitations:
-            Its penetration is that of a rigid object into an undeformed pad; here it is the membrane's own indentation.
+            In Isaac Lab, penetration is that of a rigid object into an undeformed pad; here it is the membrane's own
+            indentation.
         """
         depth = self.indentation(rest).flatten(-2)
         normals, area = (part.to(self.displacement) for part in (rest.rest_normals, rest.rest_area))
@@ -164,13 +167,13 @@ class Reconstruction(NamedTuple):
         return TactileFields(depth.clamp_min(0), push * area, shear * area[:, None])
 
     def wrench_in(self, pose: Pose) -> Tensor:
-        """The wrench `[B, 6]` in a tool's frame: total contact force, and its moment about that frame's origin.
+        """Return the wrench `[B, 6]` in a tool's frame: total contact force, and its moment about that frame's origin.
 
         Args:
-            pose: the camera's in that frame: `sensor.tool`, or `results.mesh.tool` of stored results.
+            pose: pose of the camera's frame in that frame: `sensor.tool`, or `results.mesh.tool` for stored results.
 
         Raises:
-            MembraneError: it is none, as of a sensor file without `[tool]`.
+            MembraneError: it is not a pose; for a sensor file without `[tool]` it is None.
 
         Example:
             >>> nothing = Reconstruction(*torch.zeros(len(Reconstruction._fields), 1))
@@ -184,10 +187,10 @@ class Reconstruction(NamedTuple):
         return pose.wrench(self.wrench)
 
     def to(self, *args: Any, **kwargs: Any) -> "Reconstruction":
-        """All arrays as `torch.Tensor.to` gives them: another device or precision; the status stays an integer.
+        """Return all arrays on another device or in another precision, as `torch.Tensor.to`; the status stays an integer.
 
         Raises:
-            MembraneError: no such device or precision.
+            MembraneError: the device or precision does not exist.
         """
         try:
             moved = {key: value.to(*args, **kwargs) for key, value in self._asdict().items()}
@@ -197,9 +200,9 @@ class Reconstruction(NamedTuple):
         return Reconstruction(**(moved | {"status": moved["status"].to(self.status.dtype)}))
 
     def cpu(self) -> "Reconstruction":
-        """All arrays on the CPU."""
+        """Return all arrays on the CPU."""
         return self.to("cpu")
 
     def numpy(self) -> "Reconstruction":
-        """All arrays as numpy arrays on the CPU, without gradients."""
+        """Return all arrays as numpy arrays on the CPU, without gradients."""
         return Reconstruction(**{key: value.detach().cpu().numpy() for key, value in self._asdict().items()})

@@ -1,10 +1,10 @@
-"""The statuses of a frame."""
+"""The status of a frame."""
 
 from enum import IntEnum
 
 
 class Status(IntEnum):
-    """How the reconstruction of a frame ended; results store its value, and `text` is the message.
+    """The outcome of a frame's reconstruction; results store its value, and `text` is the message.
 
     Example:
         >>> Status(4).name, Status.OK.text
@@ -38,5 +38,5 @@ class Status(IntEnum):
 
     @property
     def has_surface(self) -> bool:
-        """Whether the frame keeps its answer; all others are NaN."""
+        """Return whether the frame keeps its surface; other frames are NaN."""
         return self in (Status.OK, Status.NOT_CONVERGED) or self >= Status.UNEXPLAINED

@@ -1,4 +1,4 @@
-"""A folder of results: the settings that all its frames share, and `mesh.npz`, which holds them beside the rest surface."""
+"""The settings that all frames of a folder of results share, and `mesh.npz`, which contains them and the rest surface."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,13 +17,13 @@ from .status import Status
 from .summary_row import METRE
 
 FINISHED = tuple(status for status in Status if status.has_surface)
-"""Status of frames that are not tried again."""
+"""Statuses of frames that are not computed again."""
 FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"
 FIXED = ("element", "volume")
-"""Settings that no option of the command chooses: each estimator has its own."""
+"""Settings that no command-line option chooses: each estimator has its own."""
 ELSE = {"pressure": "not measured", "fields": "none"}
-"""Text for settings that are empty; for all others it is what the sensor has."""
+"""Texts for settings that may be empty; any other empty setting means the sensor's own."""
 
 
 class ResultMaker(Protocol):
@@ -41,7 +41,7 @@ class ResultMaker(Protocol):
 
 
 class Settings(NamedTuple):
-    """The choices that shape a result, besides the sensor: all frames of a folder share them."""
+    """The choices besides the sensor that determine a result; all frames of a folder share them."""
 
     estimator: str
     energy: str
@@ -60,8 +60,8 @@ class Settings(NamedTuple):
     def from_reconstructor(
         cls, reconstructor: ResultMaker, format: str, rest: str = "", pressure: str = "", fields: Sequence[str] = ()
     ) -> "Settings":
-        """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image,
-        `pressure`: the file of a gauge's readings, `fields`: of the surface that frames hold as well."""
+        """Return the settings of a reconstructor's results. `rest`: source of the rest state if it is not the sensor's rest
+        image; `pressure`: file of the gauge's readings; `fields`: additional fields of the surface that frames contain."""
         estimator = reconstructor.estimator
         return cls(
             estimator=reconstructor.estimator_name,
@@ -133,7 +133,7 @@ class Mesh(NamedTuple):
 
     @classmethod
     def from_reconstructor(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
-        """What the frames of a `Reconstructor` share."""
+        """Return the data that all frames of a `Reconstructor` share."""
         sensor, membrane = reconstructor.sensor, reconstructor.estimator.membrane
         return cls(
             rest_vertices=_single(membrane.rest),
@@ -160,7 +160,7 @@ class Mesh(NamedTuple):
         """Read `mesh.npz`.
 
         Raises:
-            MembraneError: there is none, or it is damaged, or not one.
+            MembraneError: the file is missing, damaged, or not a mesh.
         """
         expected = f"the {MESH} that is written beside results"
         if not Path(path).exists():
@@ -176,21 +176,21 @@ class Mesh(NamedTuple):
         return mesh
 
     def check(self, frame: dict[str, np.ndarray], path: str | Path) -> None:
-        """Refuse a frame of another membrane or other markers.
+        """Refuse a frame of another membrane or with other markers.
 
         Args:
-            frame: its arrays.
-            path: where it was read, for the message.
+            frame: arrays of the frame.
+            path: path of the frame, for the message.
 
         Raises:
-            MembraneError: an array is of another shape or type than here.
+            MembraneError: the shape or type of an array does not match this mesh.
         """
         if said := shape_mismatch(frame, len(self.rest_vertices), self.rest_pixels.shape[-2], self.views):
             raise MembraneError(f"{path}: {said} as of its {MESH}: give the {MESH} of its folder, or reconstruct it again")
 
     @property
     def views(self) -> int:
-        """How many there are, 0 of a single one."""
+        """Return the number of views, or 0 for a sensor with one view."""
         return len(self.rest_pixels) if self.rest_pixels.ndim == 3 else 0
 
     def _refuse_unlike(self) -> None:
@@ -223,41 +223,42 @@ class Mesh(NamedTuple):
 
     @property
     def settings(self) -> Settings:
-        """The choices that made the results."""
+        """Return the settings of the results."""
         return Settings(*(getattr(self, name) for name in Settings._fields))
 
     @property
     def tool(self) -> Pose | None:
-        """The camera's pose in the tool's frame, as `Reconstruction.wrench_in` takes it; None where it is not known."""
+        """Return the pose of the camera in the tool's frame, for `Reconstruction.wrench_in`; None if unknown."""
         known = len(self.camera_in_tool) > 0
         return Pose(self.camera_in_tool[:, :3], self.camera_in_tool[:, 3]) if known else None
 
     def pressure_in_words(self, pressure: float) -> str:
-        """A pressure of the results with its sign and unit: hPa, as in `summary.csv`, where forces are in N."""
+        """Return a pressure of the results as text with sign and unit: in hPa, as in `summary.csv`, if forces are in N."""
         if self.force_unit != "N" or self.length_unit not in METRE:
             return f"{pressure:+.3g} {self.force_unit}/{self.length_unit}²"
         return f"{pressure * METRE[self.length_unit] ** 2 / 100:+.3g} hPa"
 
     @property
     def file_size(self) -> tuple[int, int]:
-        """Width and height of the image files, px: of regions that of the image that they share."""
+        """Return the width and height of the image files, px; if views are regions of one image, those of that image."""
         width, height = self.image_part[2:].tolist() or self.image_size.tolist()
         return width, height
 
     def first_region(self, image: np.ndarray) -> np.ndarray:
-        """The first view's region of an image file's grey values `[height, width]`; the whole where views share no image."""
+        """Return the first view's region of an image `[height, width]`; the whole image if views do not share one."""
         left, top = self.image_part[:2].tolist() or (0, 0)
         width, height = self.image_size.tolist()
         return image[top : top + height, left : left + width] if image.shape == self.file_size[::-1] else image
 
     def normal_displacement(self, frame: dict[str, np.ndarray]) -> np.ndarray:
-        """Displacement along the rest normals, `[V]`, length unit: negative where the membrane is pressed in."""
+        """Return the displacement along the rest normals, `[V]`, length unit: negative where the membrane is pressed in."""
         along: np.ndarray = (frame["displacement"] * self.rest_normals).sum(-1)
         return along
 
 
 def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
-    """Refuse a folder whose results are of another sensor (fingerprint) or of other settings, or no results at all."""
+    """Refuse a folder with results of another sensor (by fingerprint) or other settings, or with other contents than
+    results."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise MembraneError(f"--out {folder}: is a file; expected a new folder, or one with earlier results of this sensor")
@@ -281,13 +282,13 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
 
 
 def _rows(pose: Pose | None) -> np.ndarray:
-    """Rotation and translation side by side, `[3, 4]`; `[0, 4]` without a pose."""
+    """Return rotation and translation side by side, `[3, 4]`; `[0, 4]` without a pose."""
     rows = np.zeros((0, 4)) if pose is None else np.column_stack([pose.rotation, pose.translation])
     return rows.astype(np.float32)
 
 
 def _image_part(sensor: Any) -> np.ndarray:
-    """Left and top of the first view's region, and the size of the image that views share; `[0]` where they share none."""
+    """Return the first view's left and top, and the size of the image that views share; `[0]` if they do not share one."""
     region = sensor.views[0].region if sensor.views else None
     return np.array([] if region is None else [*region[:2], *sensor.image_size], np.int64)
 

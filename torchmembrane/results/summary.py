@@ -1,4 +1,4 @@
-"""summary.csv: one row for every frame of a folder of results, and beside it the dictionary of its columns."""
+"""summary.csv: one row for each frame of a folder of results, with a description of its columns in a second file."""
 
 import csv
 from collections.abc import Callable, Iterable, Mapping
@@ -24,18 +24,19 @@ EXPECTED = "a table of results: delete it, it is made from the frames"
 MOST_BYTES = 2**30
 LONGEST_LINE = 2**16
 UNREADABLE = -1
-"""Status of a file that gave no image, hence no result."""
+"""Status of a file from which no image could be read, so that it has no result."""
 
 
 class Summary:
-    """summary.csv, made from the frames; the file itself tells only of unreadable ones, and of other shards' frames.
+    """The table summary.csv, built from the frames; only unreadable files and other shards' frames are taken from the file
+    itself.
 
-    Beside it, summary_columns.csv says what each column means, and its unit.
+    A file beside it, summary_columns.csv, gives the meaning and unit of each column.
 
     Args:
         folder: the folder of results.
-        mesh: what its frames share.
-        write_lock: held while the files are changed.
+        mesh: the data that the frames share.
+        write_lock: lock that is held while the files are changed.
     """
 
     def __init__(self, folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any]):
@@ -43,7 +44,7 @@ class Summary:
         self.rows: dict[str, dict[str, str]] = {}
 
     def add(self, name: str, stored: Stored) -> None:
-        """A row from a stored frame."""
+        """Add the row of a stored frame."""
         frame, origin, seconds = stored
         mesh, status = self.mesh, int(frame["status"])
         found = numbers(frame | {"gauge": np.asarray(origin.gauge)}, mesh.rest_normals, mesh.length_unit, mesh.force_unit)
@@ -53,11 +54,11 @@ class Summary:
         self._set(name, status, texts | {key: cell(key, value) for key, value in found.items()})
 
     def add_unreadable(self, name: str, file: Path, reason: str) -> None:
-        """A row for a file that gave no image."""
+        """Add a row for a file from which no image could be read."""
         self._set(name, UNREADABLE, {"file": printable(str(file)), "status_text": f"unreadable: {reason}"})
 
     def write(self, kept: Callable[[dict[str, str]], bool] = lambda row: True) -> None:
-        """Write the rows added since the last time beside those of the file that are kept, in name order."""
+        """Write the new rows, together with those of the existing file that `kept` selects, in name order."""
         with self.write_lock:
             rows = {row["name"]: row for row in _rows(self.path) if kept(row)} | self.rows
             lines = ({key: escaped(key, rows[name][key]) for key in NAMES} for name in sorted(rows, key=in_order))
@@ -72,10 +73,10 @@ class Summary:
 
 
 def read_summary(folder: Path) -> list[dict[str, str]]:
-    """The rows of a folder's table, cells by the columns' names.
+    """Return the rows of a folder's table, each as a dict of cells by column name.
 
     Raises:
-        MembraneError: there is none, or one of other columns.
+        MembraneError: the table is missing, or has other columns.
     """
     rows = _rows(folder / SUMMARY)
     if not rows:
@@ -94,7 +95,7 @@ def _write_table(path: Path, header: Iterable[str], rows: Iterable[dict[str, str
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    """The whole rows of an earlier summary.csv; those of other columns, or damaged, are left out."""
+    """Return the complete rows of an existing summary.csv; damaged rows and those with other columns are omitted."""
     try:
         regular_size(path, MOST_BYTES, EXPECTED)
         with open(path, newline="", encoding="utf-8", errors="replace") as file:
@@ -106,7 +107,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def _is_whole(row: dict[str, Any]) -> bool:
-    """Whether a row has all its cells, and numbers where they belong."""
+    """Return whether a row has all its cells, with numbers where they are required."""
     try:
         return None not in row.values() and all(key in TEXT or not text or float(text) is not None for key, text in row.items())
     except ValueError:

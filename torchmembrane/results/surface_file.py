@@ -1,4 +1,4 @@
-"""The surface of a frame as a mesh for other programs: PLY, or VTK's legacy format (ParaView)."""
+"""Export of a frame's surface as a mesh for other programs: PLY, or VTK's legacy format (ParaView)."""
 
 from pathlib import Path
 
@@ -12,22 +12,22 @@ from .store import Mesh
 
 SUFFIXES = (".ply", ".vtk")
 NAMES = {3: ("x", "y", "z"), 2: ("1", "2")}
-"""Names of the components of a vector, and of principal values."""
+"""Names of the components of vectors and of principal values."""
 
 
 def save_surface(path: str | Path, frame: Frame, mesh: Mesh) -> list[str]:
-    """Write a frame's surface with its normals, displacement, traction, and the principal values that it holds.
+    """Write a frame's surface with its normals, displacement and traction, and the principal values if the frame has them.
 
     Args:
-        path: the file, `.ply` or `.vtk` (both ASCII), written atomically.
-        frame: as for `Reconstruction.frame` gives it, with `stretch` and `tension` where they were asked for.
-        mesh: mesh of the folder, whose triangles these are.
+        path: path of the file, `.ply` or `.vtk` (both ASCII), written atomically.
+        frame: arrays as returned by `Reconstruction.frame`, optionally with `stretch` and `tension`.
+        mesh: mesh of the results' folder, which contains the triangles.
 
     Returns:
-        Names of the fields at the vertices.
+        The names of the fields at the vertices.
 
     Raises:
-        MembraneError: another suffix, or the frame has no surface.
+        MembraneError: the suffix is unknown, or the frame has no surface.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:

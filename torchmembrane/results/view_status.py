@@ -1,4 +1,4 @@
-"""The status of a frame of several views in words, with the names of the views that were left out or have moved."""
+"""Text of the status of a frame with several views, naming views that were left out or have moved."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,11 +7,11 @@ import numpy as np
 from .status import Status
 
 STILL = (1.0, 0.3, 0.005)
-"""px, degrees, scale: by how much the image of a camera that stands still is found to move at most."""
+"""Largest apparent motion of a stationary camera's image: px, degrees, scale."""
 
 
 def moved_views(frame: Mapping[str, np.ndarray], views: Sequence[str]) -> list[str]:
-    """Names of the views whose `camera_motion` says that their camera has moved against the rim since the rest image.
+    """Return the names of views whose `camera_motion` shows that the camera has moved against the rim since the rest image.
 
     Example:
         >>> moved_views({"camera_motion": np.array([[0.1, 0, 0, 1], [8.7, 0.2, 0, 1]])}, ["left", "right"])
@@ -26,12 +26,12 @@ def moved_views(frame: Mapping[str, np.ndarray], views: Sequence[str]) -> list[s
 
 
 def status_in_words(frame: Mapping[str, np.ndarray], views: Sequence[str], lacking: Mapping[str, str] | None = None) -> str:
-    """A frame's status in words; where a view was left out or has moved, which.
+    """Return a frame's status as text, with the names of views that were left out or have moved.
 
     Args:
-        frame: its arrays.
-        views: names of the views; none of a single one.
-        lacking: why views had no image, by their names.
+        frame: arrays of the frame.
+        views: names of the views; empty for a sensor with one view.
+        lacking: reasons why views have no image, by view name.
 
     Example:
         >>> frame = {"status": np.array(10), "confidence": np.array([[1.0, 0.9], [0.0, 0.0]])}
