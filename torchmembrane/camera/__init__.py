@@ -1,1 +1,1 @@
-"""The camera: pixels to rays and back, through lens, ports and medium."""
+"""The camera model: from pixels to rays and back, through lens, ports and medium."""

@@ -1,7 +1,8 @@
-"""Lenses as functions: the image plane (pixels less the centre, over the focal length) to unit directions and back.
+"""Lens models as functions from the image plane (pixel minus centre, over focal length) to unit directions and back.
 
-Both undo their distortion by a fixed number of Newton steps; where a distortion folds back, and beyond, is NaN. Even
-functions of the radius are taken of its square, with a safe argument on the axis: values and gradients are finite there.
+Both directions invert their distortion by a fixed number of Newton steps; the result is NaN at and beyond the radius where the
+distortion folds back. Even functions of the radius are evaluated from its square, with a safe argument on the axis, so that
+values and gradients are finite there.
 """
 
 import math
@@ -17,14 +18,14 @@ FOLD_SAMPLES = 512  # angles from the axis at which a distortion is tested for f
 
 
 def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
-    """Image positions to directions through a pinhole.
+    """Convert image positions to directions through a pinhole.
 
     Args:
-        image: `[..., 2]`, pixels less the centre, over the focal length.
-        distortion: k1 k2 p1 p2 k3, these and k4 k5 k6, or empty.
+        image: `[..., 2]`, pixel minus centre, over the focal length.
+        distortion: k1 k2 p1 p2 k3, optionally followed by k4 k5 k6, or empty.
 
     Returns:
-        Unit directions `[..., 3]`; NaN where the distortion folds back, and beyond.
+        Unit directions `[..., 3]`; NaN at and beyond the radius where the distortion folds back.
 
     Example:
         >>> k = torch.tensor([-0.2, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -50,11 +51,11 @@ def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
 
 
 def pinhole_image(points: Tensor, distortion: Tensor) -> Tensor:
-    """Points to image positions through a pinhole.
+    """Project points to image positions through a pinhole.
 
     Args:
         points: `[..., 3]`, length unit.
-        distortion: k1 k2 p1 p2 k3, these and k4 k5 k6, or empty.
+        distortion: k1 k2 p1 p2 k3, optionally followed by k4 k5 k6, or empty.
 
     Returns:
         `[..., 2]`, in focal lengths; NaN behind the camera and where the distortion folds back.
@@ -74,8 +75,8 @@ def pinhole_image(points: Tensor, distortion: Tensor) -> Tensor:
 
 
 def _pinhole_terms(distortion: Tensor) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-    """The radial coefficients k1 k2 k3 (and k4 k5 k6 if there are eight), the tangential ones p1, p2, and the radius (tangent
-    of the angle) at which the radial distortion folds."""
+    """Return the radial coefficients k1 k2 k3 (and k4 k5 k6 if there are eight), the tangential ones p1 and p2, and the radius
+    (tangent of the angle) at which the radial distortion folds back."""
     k1, k2, p1, p2, *others = distortion.unbind()
     radial = [k1, k2, *others]
     angles = torch.linspace(0, math.radians(89.9), FOLD_SAMPLES, dtype=distortion.dtype, device=distortion.device)
@@ -83,11 +84,11 @@ def _pinhole_terms(distortion: Tensor) -> tuple[list[Tensor], Tensor, Tensor, Te
 
 
 def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """OpenCV's radial and tangential distortion.
+    """Apply OpenCV's radial and tangential distortion.
 
     Args:
         xy: `[..., 2]`, undistorted, in focal lengths.
-        radial: up to three, k1 k2 k3, or k1 to k6 of the rational model.
+        radial: up to three coefficients k1 k2 k3, or k1 to k6 of the rational model.
         p1: first tangential coefficient.
         p2: second tangential coefficient.
 
@@ -110,14 +111,14 @@ def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[T
 
 
 def fisheye_direction(image: Tensor, distortion: Tensor) -> Tensor:
-    """Image positions to directions through a fisheye lens.
+    """Convert image positions to directions through a fisheye lens.
 
     Args:
-        image: `[..., 2]`, pixels less the centre, over the focal length (rad, distorted).
+        image: `[..., 2]`, pixel minus centre, over the focal length (distorted angle, rad).
         distortion: k1 k2 k3 k4, or empty.
 
     Returns:
-        Unit directions `[..., 3]`; NaN where the distortion folds back, and beyond.
+        Unit directions `[..., 3]`; NaN at and beyond the radius where the distortion folds back.
 
     Example:
         >>> fisheye_direction(torch.tensor([torch.pi / 2, 0.0]), torch.zeros(0)).round(decimals=6).tolist()
@@ -143,14 +144,14 @@ def fisheye_direction(image: Tensor, distortion: Tensor) -> Tensor:
 
 
 def fisheye_image(points: Tensor, distortion: Tensor) -> Tensor:
-    """Points to image positions through a fisheye lens, up to 180 degrees from the axis.
+    """Project points to image positions through a fisheye lens, up to 180 degrees from the axis.
 
     Args:
         points: `[..., 3]`, length unit.
         distortion: k1 k2 k3 k4, or empty.
 
     Returns:
-        `[..., 2]`, rad, distorted; NaN where the distortion folds back, and on the axis behind the camera.
+        `[..., 2]`, distorted angle, rad; NaN where the distortion folds back, and on the axis behind the camera.
 
     Example:
         >>> fisheye_image(torch.tensor([2.0, 0.0, 0.0]), torch.zeros(0)).round(decimals=4).tolist()
@@ -170,7 +171,7 @@ def fisheye_image(points: Tensor, distortion: Tensor) -> Tensor:
 
 
 def fisheye_fold(distortion: Tensor) -> Tensor:
-    """The angle from the axis, rad, up to which a fisheye images more and more; pi where it does not fold back.
+    """Return the angle from the axis, rad, up to which the image radius of a fisheye increases; pi if it never folds back.
 
     Args:
         distortion: k1 k2 k3 k4.
@@ -187,7 +188,7 @@ def fisheye_fold(distortion: Tensor) -> Tensor:
 
 
 def _radial(r_squared: Tensor, coefficients: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """`1 + sum_i k_i r^(2 i)` and its derivative in r^2."""
+    """Return `1 + sum_i k_i r^(2 i)` and its derivative with respect to r^2."""
     factor, rate = torch.zeros_like(r_squared), torch.zeros_like(r_squared)
     descending: list[Tensor | float] = [*reversed(coefficients), 1.0]
     for k in descending:
@@ -196,7 +197,8 @@ def _radial(r_squared: Tensor, coefficients: Sequence[Tensor]) -> tuple[Tensor, 
 
 
 def _ratio(r_squared: Tensor, radial: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """`(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)` and its derivative in r^2; of three, k4 to k6 are 0."""
+    """Return `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)` and its derivative with respect to r^2; with
+    three coefficients, k4 to k6 are 0."""
     factor, rate = _radial(r_squared, radial[:3])
     if len(radial) > 3:
         divisor, slope = _radial(r_squared, radial[3:])
@@ -206,7 +208,7 @@ def _ratio(r_squared: Tensor, radial: Sequence[Tensor]) -> tuple[Tensor, Tensor]
 
 
 def _fold(radii: Tensor, coefficients: Sequence[Tensor], below: Sequence[Tensor] = ()) -> Tensor:
-    """The last of the increasing `radii [S]` up to which the distorted radius increases, and its divisor is positive."""
+    """Return the last of the increasing `radii [S]` up to which the distorted radius increases and its divisor is positive."""
     squared = radii * radii
     factor, rate = _ratio(squared, [*coefficients, *below]) if below else _radial(squared, coefficients)
     increases = (factor + 2 * squared * rate > 0) & (_radial(squared, below)[0] > 0)
@@ -215,7 +217,7 @@ def _fold(radii: Tensor, coefficients: Sequence[Tensor], below: Sequence[Tensor]
 
 
 def _tolerance(value: Tensor) -> float:
-    """How far from its target, in focal lengths, Newton may end and still count as having found the position."""
+    """Return the distance from the target, in focal lengths, within which Newton's method counts as converged."""
     epsilon: float = torch.finfo(value.dtype).eps
     tolerance: float = epsilon ** (2 / 3)
     return tolerance

@@ -1,4 +1,4 @@
-"""Lenses whose distortion folds back within the image: beyond that radius pixels would show other points once more."""
+"""Detection of lens distortion that folds back within the image, beyond which pixels would show other points again."""
 
 import math
 
@@ -9,17 +9,18 @@ from ..errors import MembraneError
 from .distortion import fisheye_direction, fisheye_fold, pinhole_direction
 from .model import Camera
 
-DIRECTIONS, STEPS = 32, 256  # from the centre to each side of the image, in which it is looked for folds, and steps of each
+DIRECTIONS, STEPS = 32, 256  # directions searched from the centre to each side of the image, and steps along each
 
 
 def fold_in_image(camera: Camera) -> float:
-    """Where a camera's distortion folds within its image.
+    """Find the radius at which a camera's distortion folds back within its image.
 
     Args:
-        camera: any; its ports play no part.
+        camera: any camera; its ports are ignored.
 
     Returns:
-        The least distance from the centre, px, to one or two, at which a pixel of the image shows nothing; inf: none does.
+        The smallest distance from the centre, accurate to one or two px, at which a pixel shows nothing; inf if all pixels show
+        something.
 
     Example:
         >>> lens = "pinhole", (640, 480), (400, 400), (320, 240)
@@ -40,17 +41,17 @@ def fold_in_image(camera: Camera) -> float:
 
 
 def refuse_folds(camera: Camera, points: Tensor) -> None:
-    """Refuse a lens that folds within the image.
+    """Refuse a lens whose distortion folds back within the image.
 
-    What a fisheye images may end within the image, in a circle: beyond the largest circle about its centre that the image holds
-    it may fold, where it shows all of the membrane.
+    A fisheye's image may be a circle within the image. Outside the largest circle about its centre that fits into the image,
+    its distortion may fold back, provided that all of the membrane is imaged.
 
     Args:
         camera: the camera.
         points: points of the membrane at rest, `[V, 3]`, camera frame.
 
     Raises:
-        MembraneError: with the radius at which it folds.
+        MembraneError: the distortion folds back; the message contains the radius.
     """
     radius = fold_in_image(camera)
     (u, v), (width, height) = camera.centre.tolist(), camera.image_size

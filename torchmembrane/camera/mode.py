@@ -1,4 +1,4 @@
-"""Modes of a camera: a part of the image that it was calibrated with, and pixels that are put together in blocks."""
+"""Camera modes: a cropped part of the image that was calibrated, with its pixels binned in blocks."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,20 +9,20 @@ from ..errors import expect
 
 
 class Mode(NamedTuple):
-    """What a camera's images are of those that it was calibrated with: cropped, then binned.
+    """How a camera's images are obtained from those it was calibrated with: cropped, then binned.
 
-    A block of `b x c` pixels of the crop becomes one, their mean. With centres of pixels at integers, what was seen at `u` is
-    seen at `(u - left - (b - 1) / 2) / b`. Distortion, ports and what stands for angles do not change.
+    A block of `b x c` pixels of the crop becomes one pixel, their mean. With pixel centres at integers, the position `u`
+    becomes `(u - left - (b - 1) / 2) / b`. Distortion, ports and all quantities that are angles do not change.
 
     Attributes:
-        image_size: size of the calibration, width and height, px.
-        focal: focal lengths of the calibration, along u and v, px (fisheye: px / rad).
-        centre: centre of the calibration, px.
-        crop: left, top, width, height of the part that is kept, px of the calibration.
-        binning: pixels of a block along u and v.
+        image_size: width and height of the calibrated image, px.
+        focal: calibrated focal lengths along u and v, px (fisheye: px / rad).
+        centre: calibrated principal point, px.
+        crop: left, top, width and height of the part that is kept, px of the calibrated image.
+        binning: width and height of a block, px.
 
     Limitations:
-        A chip that skips lines in place of averaging them sees the block's first pixel, `(b - 1) / (2 b)` px beside its middle.
+        A chip that skips lines instead of averaging them shows the block's first pixel, `(b - 1) / (2 b)` px beside its middle.
 
     Example:
         >>> mode = Mode((640, 480), (400.0, 400.0), (320.0, 240.0), (80, 0, 480, 480), (2, 2))
@@ -45,10 +45,10 @@ class Mode(NamedTuple):
         crop: Sequence[float],
         binning: Sequence[float],
     ) -> "Mode":
-        """The mode with these values, checked.
+        """Return the mode with these values after checking them.
 
         Raises:
-            MembraneError: a crop beyond the image, or blocks that do not fill it; names the value and what was expected.
+            MembraneError: the crop exceeds the image, or the blocks do not fill it.
 
         Example:
             >>> Mode.from_camera((640, 480), (400.0, 400.0), (320.0, 240.0), (0, 0, 640, 480), (3, 3))
@@ -78,31 +78,31 @@ width and height of the crop, 640 x 480: crop = [0, 0, 639, 480] would do
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the mode's images, px."""
+        """Return the width and height of the mode's images, px."""
         return self.crop[2] // self.binning[0], self.crop[3] // self.binning[1]
 
     @property
     def binned_focal(self) -> tuple[float, float]:
-        """Along u and v, px of the mode (fisheye: px / rad)."""
+        """Return the focal lengths along u and v, px of the mode (fisheye: px / rad)."""
         return self.focal[0] / self.binning[0], self.focal[1] / self.binning[1]
 
     @property
     def binned_centre(self) -> tuple[float, float]:
-        """The principal point, px of the mode."""
+        """Return the principal point, px of the mode."""
         u, v = ((c - first - (b - 1) / 2) / b for c, first, b in zip(self.centre, self.crop[:2], self.binning, strict=True))
         return u, v
 
     def image(self, image: np.ndarray) -> np.ndarray:
-        """An image of the calibrated size as this mode gives it.
+        """Crop and bin an image of the calibrated size as this mode does.
 
         Args:
-            image: grey, `[height, width]`.
+            image: grey image, `[height, width]`.
 
         Returns:
-            `[height, width]` of the mode, float32.
+            The image in this mode, `[height, width]`, float32.
 
         Raises:
-            MembraneError: an image of another size.
+            MembraneError: the image has another size.
 
         Example:
             >>> mode = Mode((4, 2), (1.0, 1.0), (0.0, 0.0), (2, 0, 2, 2), (2, 2))

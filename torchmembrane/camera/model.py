@@ -1,7 +1,8 @@
-"""Pixels to viewing rays and back: pinhole and fisheye lenses, optionally behind flat refractive layers.
+"""From pixels to viewing rays and back: pinhole and fisheye lenses, optionally behind flat refractive layers.
 
-Camera frame: origin at the centre of projection, +z the optical axis towards the membrane, pixels (u right, v down)
-with centres at integers. What a camera cannot see (behind it, where its lens folds, before a port's far face) is NaN.
+Camera frame: origin at the centre of projection, +z along the optical axis towards the membrane, pixels (u right, v down) with
+centres at integers. Points that a camera cannot see (behind it, where its lens folds back, or before the far face of its ports)
+are NaN.
 """
 
 import math
@@ -50,7 +51,7 @@ class Rays(NamedTuple):
 
 @check_arguments
 class Camera(ImageMotion, nn.Module):
-    """A pinhole or fisheye camera, central in air or looking through flat layers into a medium.
+    """A pinhole or fisheye camera, in air or looking through flat layers into a medium.
 
     The parameters are float64 buffers that enter the arithmetic directly, so `torch.func.functional_call` can
     differentiate with respect to any of them.
@@ -62,25 +63,25 @@ class Camera(ImageMotion, nn.Module):
         focal: along u and v, px (fisheye: px / rad).
         centre: the principal point, px.
         distortion: coefficients; what is left off is zero, an empty list leaves the distortion out of the computation.
-        ports: layers (distance, thickness, index) in order from the camera; what lies before and between them is air.
-        medium_index: refractive index of all that follows the last port; without ports it plays no part.
-        bits: bits of its values, 8 to 16, where images of 16 bits hold fewer; None: all bits of what they are stored in.
+        ports: layers (distance, thickness, index) in order from the camera; the space before and between them is air.
+        medium_index: refractive index of the medium behind the last port; ignored without ports.
+        bits: significant bits of the pixel values, 8 to 16, for images stored in 16 bits with fewer; None: all stored bits.
 
     Attributes:
-        focal: `[2]`, as all others a float64 tensor.
+        focal: `[2]`, a float64 tensor, as all others.
         centre: `[2]`.
         distortion: `[0, 4, 5 or 8]`.
         port_distance: `[P]`.
         port_thickness: `[P]`.
         port_index: `[P]`.
         medium_index: `[]`.
-        mode: the `Mode` that made this camera of the calibrated one, else None; `in_mode` sets it.
+        mode: the `Mode` that derived this camera from the calibrated one, else None; set by `in_mode`.
 
     Raises:
-        MembraneError: a value is not finite, of the wrong count or sign, or ports overlap.
+        MembraneError: a value is not finite or has the wrong sign, a count is wrong, or ports overlap.
 
     Limitations:
-        No curved or tilted ports. The last 0.4 degrees before a distortion folds back count as not seen.
+        Ports cannot be curved or tilted. The last 0.4 degrees before a distortion folds back count as not visible.
 
     Example:
         >>> camera = Camera("pinhole", (640, 480), (400, 400), (320, 240), ports=[(2, 3, 1.49)], medium_index=1.33)
@@ -134,28 +135,28 @@ class Camera(ImageMotion, nn.Module):
 
     @property
     def image_sizes(self) -> list[tuple[int, int]]:  # type: ignore[override]
-        """Its own alone."""
+        """Return the size of its image, in a list of one."""
         return [self.image_size]
 
     @property
     def ports(self) -> list[Port]:
-        """The flat layers in order from the camera, as numbers."""
+        """Return the flat layers in order from the camera, as numbers."""
         rows = torch.stack([self.port_distance, self.port_thickness, self.port_index], -1)
         return [Port(*row) for row in rows.tolist()]
 
     @check_arguments
     def in_mode(self, crop: Sequence[float] | None = None, binning: float | Sequence[float] = 1) -> "Camera":
-        """The camera whose images are cropped, then binned: the same rays at the mode's pixels.
+        """Return the camera whose images are cropped, then binned: it has the same rays at the mode's pixels.
 
         Args:
-            crop: left, top, width, height of the part that is kept, px of this camera; None: the whole image.
-            binning: pixels of a block, whose mean becomes one pixel, along u and v; one number for both.
+            crop: left, top, width and height of the part that is kept, px of this camera; None: the whole image.
+            binning: size along u and v of a block whose mean becomes one pixel, px; one number for both.
 
         Returns:
-            A camera with image size, focal lengths and centre of the mode, which is its `mode`.
+            A camera with image size, focal lengths and centre of the mode, which is stored as its `mode`.
 
         Raises:
-            MembraneError: a crop beyond the image, or blocks that do not fill it.
+            MembraneError: the crop exceeds the image, or the blocks do not fill it.
 
         Example:
             >>> camera = Camera("pinhole", (640, 480), (400, 400), (320, 240)).in_mode((80, 0, 480, 480), 2)
@@ -171,16 +172,16 @@ class Camera(ImageMotion, nn.Module):
         return made
 
     def pixel_to_ray(self, pixels: Tensor) -> Rays:
-        """The ray on which a pixel's light travels in the medium (section 2, eq. 2; section 5.2 through ports).
+        """Return the ray along which a pixel's light travels in the medium (section 2, eq. 2; section 5.2 through ports).
 
-        Without ports origins are zero. Behind ports the refracted ray, prolonged backwards, meets the optical axis at
-        its origin `(0, 0, z)`: see `ports.refract`. Smooth on the axis.
+        Without ports the origins are zero. Behind ports, the refracted ray extended backwards meets the optical axis at its
+        origin `(0, 0, z)`: see `ports.refract`. The result is smooth on the axis.
 
         Args:
             pixels: `[..., 2]`, px.
 
         Returns:
-            `Rays` of `[..., 3]`; directions (behind ports origins too) NaN where the lens does not image anything.
+            `Rays` of `[..., 3]`; directions (behind ports also origins) are NaN where the lens does not image anything.
 
         Example:
             >>> camera = Camera("fisheye", (640, 480), (180, 180), (320, 240))
@@ -196,14 +197,14 @@ class Camera(ImageMotion, nn.Module):
         return Rays(*refract(direction, self._layers(), self.medium_index))
 
     def point_to_pixel(self, points: Tensor) -> Tensor:
-        """The pixel at which a point is seen.
+        """Return the pixel at which a point is seen.
 
         Args:
             points: `[..., 3]`, length unit, camera frame.
 
         Returns:
-            `[..., 2]`, px; NaN behind the camera (fisheye without ports: only at the axis' far half and where the lens
-            folds), and behind ports NaN for all that is not beyond the last layer's far face.
+            `[..., 2]`, px; NaN behind the camera (fisheye without ports: only on the axis behind the camera, and where the lens
+            folds back) and, with ports, for all points that are not beyond the far face of the last layer.
 
         Example:
             >>> camera = Camera("pinhole", (640, 480), (400, 400), (320, 240))
@@ -217,17 +218,18 @@ class Camera(ImageMotion, nn.Module):
         return lens(points, self.distortion) * self.focal + self.centre
 
     def lines_of_sight(self, points: Tensor) -> Tensor:
-        """From the centre of projection to points `[..., 3]`, refraction apart: the points themselves."""
+        """Return the vectors from the centre of projection to points `[..., 3]`, without refraction: the points themselves."""
         return points
 
     def can_image(self, points: Tensor) -> Tensor:
-        """Whether points lie where the lens can image something: before a pinhole, beyond the last port, around a fisheye.
+        """Return whether points lie where the lens can image: in front of a pinhole, beyond the last port, around a fisheye.
 
         Args:
             points: `[..., 3]`, length unit, camera frame.
 
         Returns:
-            `[...]` bool; where it is true a point may still be out of view, or beyond the angle at which the lens folds.
+            `[...]` bool; points for which it is true may still be outside the image, or beyond the angle where the lens folds
+            back.
 
         Example:
             >>> point = torch.tensor([9.0, 0.0, -1.0])
@@ -241,7 +243,7 @@ class Camera(ImageMotion, nn.Module):
         return (points != 0).any(-1)
 
     def forward(self, points: Tensor) -> Tensor:
-        """The same as `point_to_pixel`.
+        """Return the same as `point_to_pixel`.
 
         Args:
             points: `[..., 3]`, length unit, camera frame.

@@ -1,6 +1,6 @@
-"""Flat refractive layers normal to the optical axis: the ray behind them, and the point that is seen through them.
+"""Flat refractive layers normal to the optical axis: rays behind them, and points seen through them.
 
-Written for the square of the distance from the axis alone, so that values and gradients are finite and smooth on it.
+All formulas use only the square of the distance from the axis, so that values and gradients are finite and smooth on it.
 """
 
 import math
@@ -17,10 +17,10 @@ PORT_STEPS = 10  # Newton steps to the refracted ray of a point
 
 
 class Port(NamedTuple):
-    """A flat layer normal to the axis.
+    """A flat layer normal to the optical axis.
 
     Attributes:
-        distance: from the centre of projection to its near face, length unit.
+        distance: distance from the centre of projection to the near face, length unit.
         thickness: length unit.
         index: refractive index.
 
@@ -35,12 +35,12 @@ class Port(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """What light passes on its way from the lens to the far face of the last port: the gaps, of air, then the ports.
+    """The layers that light passes from the lens to the far face of the last port: gaps of air, then the ports.
 
     Attributes:
-        heights: `[2 P]`, along the axis.
-        indices: `[2 P]`, refractive.
-        far: `[]`, depth of the last far face.
+        heights: thicknesses along the axis, `[2 P]`.
+        indices: refractive indices, `[2 P]`.
+        far: depth of the last far face, `[]`.
     """
 
     heights: Tensor
@@ -49,12 +49,12 @@ class Layers(NamedTuple):
 
 
 def layers_of(distance: Tensor, thickness: Tensor, index: Tensor) -> Layers:
-    """Ports and the gaps before them as one stack.
+    """Combine ports and the gaps before them to one stack.
 
     Args:
-        distance: `[P]`, of the near faces.
-        thickness: `[P]`.
-        index: `[P]`.
+        distance: distances of the near faces, `[P]`.
+        thickness: thicknesses of the ports, `[P]`.
+        index: refractive indices, `[P]`.
 
     Returns:
         `Layers`.
@@ -70,18 +70,19 @@ def layers_of(distance: Tensor, thickness: Tensor, index: Tensor) -> Layers:
 
 
 def refract(direction: Tensor, layers: Layers, medium_index: Tensor) -> tuple[Tensor, Tensor]:
-    """The ray in the medium of a direction in air.
+    """Return the ray in the medium that belongs to a direction in air.
 
-    Snell's law keeps the transverse part `s = (s_x, s_y)` of index times direction. Prolonged backwards the refracted ray meets
-    the axis at `z = sum_i h_i (1 - sqrt((n^2 - s^2) / (n_i^2 - s^2)))`; its direction is `(s_x, s_y, sqrt(n^2 - s^2)) / n`.
+    Snell's law preserves the transverse part `s = (s_x, s_y)` of refractive index times direction. The refracted ray extended
+    backwards meets the axis at `z = sum_i h_i (1 - sqrt((n^2 - s^2) / (n_i^2 - s^2)))`; its direction is
+    `(s_x, s_y, sqrt(n^2 - s^2)) / n`.
 
     Args:
         direction: unit vectors `[..., 3]`, in air.
-        layers: heights `h_i`, indices `n_i`.
-        medium_index: `n []`, of all behind the last layer.
+        layers: heights `h_i` and indices `n_i`.
+        medium_index: refractive index n of the medium behind the last layer, `[]`.
 
     Returns:
-        Origins on the axis and unit directions, `[..., 3]`; NaN for directions that do not go ahead.
+        Origins on the axis and unit directions, `[..., 3]`; NaN for directions that do not point forwards.
     """
     ahead = direction[..., 2:] > 0
     cosine_squared = torch.where(ahead, direction[..., 2:], 1.0) ** 2
@@ -94,7 +95,7 @@ def refract(direction: Tensor, layers: Layers, medium_index: Tensor) -> tuple[Te
 
 
 def apparent_points(points: Tensor, layers: Layers, medium_index: Tensor) -> Tensor:
-    """Where points in the medium seem to be, for a lens in air.
+    """Return where points in the medium appear to be, for a lens in air.
 
     With rho the distance from the axis and w = tan(angle in air) / rho, Snell's law is `g(w) = 0`,
     `g(w) = sum_i h_i w / sqrt(n_i^2 + (n_i^2 - 1) rho^2 w^2) - 1`, concave and increasing for n_i >= 1, and
@@ -102,11 +103,12 @@ def apparent_points(points: Tensor, layers: Layers, medium_index: Tensor) -> Ten
 
     Args:
         points: `[..., 3]`, length unit, camera frame.
-        layers: heights `h_i`, indices `n_i`.
-        medium_index: `[]`, of all behind the last layer.
+        layers: heights `h_i` and indices `n_i`.
+        medium_index: refractive index of the medium behind the last layer, `[]`.
 
     Returns:
-        `[..., 3]`, at z = 1 in the direction from which the light enters the lens; NaN before the last layer's far face.
+        `[..., 3]`, the point at z = 1 in the direction from which the light enters the lens; NaN before the last layer's far
+        face.
     """
     xy, z = points[..., :2], points[..., 2:]
     behind = z > layers.far
@@ -127,11 +129,11 @@ def check_ports(owner: str, ports: Sequence[Sequence[float]]) -> None:
     """Refuse ports that are not finite, not in order from the camera, or overlap.
 
     Args:
-        owner: named first in the message.
-        ports: distance, thickness, index of each.
+        owner: name at the beginning of the message.
+        ports: distance, thickness and index of each port.
 
     Raises:
-        MembraneError: names the port, its value and what was expected.
+        MembraneError: a port is invalid; the message contains the port and its value.
 
     Example:
         >>> check_ports("Camera", [(2.0, 3.0, 0.9)])

@@ -1,4 +1,4 @@
-"""Several views of one scene, cameras and mirrors, in the frame of the first."""
+"""Several views of one scene, by cameras and mirrors, in the frame of the first view."""
 
 import copy
 from collections.abc import Sequence
@@ -12,16 +12,16 @@ from .motion import ImageMotion
 
 
 class Rig(ImageMotion, nn.Module):
-    """Cameras that see the same markers: pixels and points are those of the first view, then those of the second, and so on.
+    """Cameras that see the same markers; pixels and points are listed view by view, those of the first view first.
 
     Args:
-        cameras: W of them.
-        poses: poses of their frames in the first one's; they reflect for mirrors.
-        outside: which of them look at the membrane's outer side; default: none.
+        cameras: the W cameras.
+        poses: poses of their frames in the first camera's frame; they are reflections for mirrors.
+        outside: whether each camera looks at the membrane's outer side; default: none does.
 
     Attributes:
-        rotation: `[W, 3, 3]`.
-        translation: `[W, 3]`, the centres of projection.
+        rotation: rotations of the poses, `[W, 3, 3]`.
+        translation: centres of projection, `[W, 3]`, length unit.
 
     Example:
         >>> import numpy as np
@@ -47,16 +47,16 @@ class Rig(ImageMotion, nn.Module):
 
     @property
     def image_sizes(self) -> list[tuple[int, int]]:  # type: ignore[override]
-        """Of all views."""
+        """Return the image sizes of all views."""
         return [camera.image_size for camera in self.cameras]  # type: ignore[misc]
 
     @property
     def focal(self) -> Tensor:
-        """Of all views, `[W, 2]` px."""
+        """Return the focal lengths of all views, `[W, 2]` px."""
         return torch.stack([camera.focal for camera in self.cameras])  # type: ignore[misc]
 
     def pixel_to_ray(self, pixels: Tensor) -> Rays:
-        """The rays `[..., N, 3]` of pixels `[..., N, 2]`, in the first view's frame; as `Camera.pixel_to_ray`."""
+        """Return the rays `[..., N, 3]` of pixels `[..., N, 2]` in the first view's frame; see `Camera.pixel_to_ray`."""
         origins, directions = [], []
         for w, part in enumerate(self._each(pixels)):
             ray = self.cameras[w].pixel_to_ray(part)  # type: ignore[operator]
@@ -66,35 +66,36 @@ class Rig(ImageMotion, nn.Module):
         return Rays(torch.cat(origins, -2), torch.cat(directions, -2))
 
     def point_to_pixel(self, points: Tensor) -> Tensor:
-        """The pixels `[..., N, 2]` at which points `[..., N, 3]` are seen; as `Camera.point_to_pixel`."""
+        """Return the pixels `[..., N, 2]` at which points `[..., N, 3]` are seen; see `Camera.point_to_pixel`."""
         each = enumerate(self._each(points - self.centres(points)))
         return torch.cat([self.cameras[w].point_to_pixel(part @ self.rotation[w].to(part)) for w, part in each], -2)  # type: ignore[operator]
 
     def lines_of_sight(self, points: Tensor) -> Tensor:
-        """From the centres of projection to points `[..., N, 3]`; of a view from outside the other way."""
+        """Return the vectors from the centres of projection to points `[..., N, 3]`; reversed for views from outside."""
         return (points - self.centres(points)) * self.inwards.repeat_interleave(points.shape[-2] // len(self.inwards))[:, None]
 
     def centres(self, points: Tensor) -> Tensor:
-        """The centres of projection of what sees points `[..., N, 3]`, `[N, 3]`."""
+        """Return the centres of projection of the views that see points `[..., N, 3]`, `[N, 3]`."""
         return self.translation.repeat_interleave(points.shape[-2] // len(self.translation), 0)
 
     def _each(self, values: Tensor) -> tuple[Tensor, ...]:
-        """Pixels or points of each view."""
+        """Split pixels or points by view."""
         each: tuple[Tensor, ...] = values.unflatten(-2, (len(self.cameras), -1)).unbind(-3)
         return each
 
 
 def turns_by_noise(camera: Camera | Rig, pixels: Tensor, points: Tensor, covariance: Tensor) -> Tensor:
-    """How noise of pixels turns their rays, as points on these see it.
+    """Return the rotations of the viewing rays that pixel noise causes, about the points on the rays.
 
     Args:
-        camera: what sees them.
-        pixels: `[B, N, 2]`.
-        points: `[B, N, 3]`: behind a port a ray's origin moves too, which turns it about a point.
+        camera: the camera, or the rig of several views.
+        pixels: pixels of the rays, `[B, N, 2]`.
+        points: points on the rays, `[B, N, 3]`; behind a port the noise moves a ray's origin too, so that it turns about a
+            point.
         covariance: covariance of the pixels, `[N, 2, 2]` px^2.
 
     Returns:
-        `[B, N, 2, 3]`, the turns by one standard deviation of two independent noises.
+        `[B, N, 2, 3]`, the rotations by one standard deviation of two independent noise components.
     """
     distance = torch.linalg.vector_norm(points - camera.pixel_to_ray(pixels).origin, dim=-1)[:, None, :, None]
     half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
