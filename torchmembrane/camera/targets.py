@@ -50,7 +50,7 @@ class Checkerboard:
         return self.points[:, None]
 
     def reflectance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the printed reflectance at `x, y`: 0.1 on dark squares, on light ones and the margin of one square around them 0.9."""
+        """Return the printed reflectance at `x, y`: 0.1 on dark squares, 0.9 on light ones and the margin."""
         i, j = np.floor(x / self.square), np.floor(y / self.square)
         inside = (i >= -1) & (i < self.columns) & (j >= -1) & (j < self.rows)
         return np.where(inside & ((i + j) % 2 == 0), 0.1, 0.9)

@@ -1,4 +1,4 @@
-"""How much of a membrane the markers that are found still see."""
+"""The share of a membrane that the markers found in an image cover."""
 
 import torch
 import torch.nn.functional as F
@@ -7,29 +7,29 @@ from torch import Tensor, nn
 from ..surface.membrane import Membrane
 
 MARKERS_PER_VERTEX = 4
-"""Markers that a vertex is asked of."""
+"""Number of nearest markers that are examined for each vertex."""
 MARKER_REACH = 1.5
-"""How far a marker sees, over the markers' spacing."""
+"""Radius of the area that a marker covers, over the markers' spacing."""
 LEAST_COVERAGE = 0.85
-"""Of what the markers see at rest: where they see less, a part of the membrane is hidden."""
+"""Share of the area covered at rest below which a part of the membrane counts as hidden."""
 LEAST_FACING = 0.5
-"""Of how a marker faces the camera at rest: one that faces it less is lost to the press, and hidden by nothing."""
+"""Share of its facing at rest below which a lost marker counts as turned away by the press, not as hidden."""
 
 
 def facings(points: Tensor, normals: Tensor) -> Tensor:
-    """How surfaces at `points [..., D, 3]` with outward `normals [..., D, 3]` of any length face the camera that sees them
-    from within: the cosines of the angles between normals and lines of sight, refraction apart, `[..., D]`."""
+    """Return how directly surfaces at `points [..., D, 3]` with outward `normals [..., D, 3]` of any length face a camera
+    inside: the cosines of the angles between normals and lines of sight, without refraction, `[..., D]`."""
     return F.cosine_similarity(points, normals, dim=-1)
 
 
 class Coverage(nn.Module):
-    """The share of a membrane's area near markers that are found, of what is near those seen at rest.
+    """The share of a membrane's area that found markers cover, relative to the area covered by those seen at rest.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        positions: of the markers, `[D, 3]`.
-        seen: `[D]` bool, which of them are seen at rest; of W views `[W D]`, view by view.
-        facing: `[D]` or `[W D]`, how they face the camera at rest, as of `facings`.
+        positions: positions of the markers, `[D, 3]`.
+        seen: `[D]` bool, which of them are seen at rest; for W views `[W D]`, view by view.
+        facing: `[D]` or `[W D]`, how directly they face the camera at rest, as returned by `facings`.
     """
 
     seen: Tensor
@@ -53,15 +53,15 @@ class Coverage(nn.Module):
         self.register_buffer("share", area / area.sum())
 
     def forward(self, confidence: Tensor) -> Tensor:
-        """The share `[B]`, of markers with `confidence [B, D]`, 0 where one is lost; of several views `[B, W D]`."""
+        """Return the share `[B]` for markers with `confidence [B, D]`, 0 for lost ones; for several views `[B, W D]`."""
         found = (confidence > 0).to(self.near.dtype)
         found = found if self.views == 1 else found.unflatten(1, (self.views, -1)).amax(1)
         seen: Tensor = (found[:, self.nearest] * self.near).amax(-1) @ self.share
         return seen
 
     def in_view(self, confidence: Tensor, facing: Tensor) -> Tensor:
-        """The same, those counted too that the press has turned away: by how the markers on the surface found face the camera,
-        `facing [B, D]`."""
+        """Return the same share, but also count lost markers that the press has turned away from the camera, according to how
+        directly the markers on the reconstructed surface face it, `facing [B, D]`."""
         turned = facing < LEAST_FACING * self.facing
         if self.views > 1:  # from every view that saw it at rest
             turned = (turned | ~self.seen).unflatten(1, (self.views, -1)).all(1).repeat(1, self.views)

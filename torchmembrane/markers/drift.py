@@ -1,14 +1,13 @@
-"""Whether the markers still rest where they are taken to: their running mean over frames in which nothing touches.
+"""Detection of drift: whether the markers still rest where expected, from their running mean over frames without contact.
 
-What ages a rest image, temperature, creep, swelling, pressure, a moved camera, moves all markers a little, as a smooth field.
-The mean displacement of frames without contact, whitened by the noise that is frozen in the rest image, is projected on
-polynomials of the image: `S` is the square of these `k` coefficients, `U` that of what is left. By noise alone `S / v` is
-chi-squared of k, where `v = 1 + share x scatter` adds the noise that the frames' mean has kept; with a drift of `LEAST_DRIFT`,
-which does not matter, it is noncentral, by `lambda`. So
+Temperature, creep, swelling, pressure or a moved camera displace all markers slightly, as a smooth field. The mean displacement
+of frames without contact, whitened by the frozen noise of the rest image, is projected on polynomials of the image position:
+`S` is the sum of squares of these `k` coefficients, `U` that of the remainder. With noise alone, `S / v` follows a chi-squared
+distribution with k degrees of freedom, where `v = 1 + share x scatter` adds the noise that remains in the frames' mean. With a
+harmless drift of `LEAST_DRIFT`, the distribution is noncentral, with parameter `lambda`. Therefore
 
-    z = (S / v - k - lambda) / sqrt(2 k + 4 lambda)
-
-counts standard deviations beyond both. A touch too light to be found moves the markers near it: it leaves a large `U`.
+is the number of standard deviations beyond both. A contact that is too light to be detected moves only the markers near it and
+leaves a large `U`.
 """
 
 from typing import NamedTuple
@@ -19,29 +18,30 @@ from torch import Tensor
 from ..camera.motion import motion_of_pixels
 
 POLYNOMIAL_ORDER = 4
-"""Of the polynomials; lower where there are fewer than `MARKERS_PER_TERM` markers for each of their terms."""
+"""Degree of the polynomials; lower if there are fewer than `MARKERS_PER_TERM` markers for each term."""
 MARKERS_PER_TERM = 3
 FRAMES_OF_MEAN = 15
-"""Frames over which the mean runs."""
+"""Number of frames of the running mean."""
 FEWEST_FRAMES = 10
-"""Frames before anything is said."""
+"""Number of frames before a drift is reported."""
 LEAST_DRIFT = 0.02
-"""px, rms: a drift that does not matter; some sensors take three times as much for a contact."""
+"""px, rms: a drift that does not matter; some sensors mistake three times as much for a contact."""
 NEAR_REST = 0.05
-"""px, rms: a contact that moves the markers by less from where they lay without one is one that the drift makes."""
+"""px, rms: largest deviation of the markers from their positions without contact at which a contact is ascribed to drift."""
 LEAST_CERTAINTY = 6.0
-"""Standard deviations of a drift that is said."""
+"""Standard deviations from which a drift is reported."""
 LARGEST_ROUGHNESS = 0.04
-"""Share of the mean displacement, squared and beyond its noise, that a smooth field leaves of a drift; a touch leaves more."""
+"""Largest share of a drift's squared mean displacement, beyond noise, that a smooth field does not explain; a contact leaves
+more."""
 
 
 class Drift(NamedTuple):
-    """What a stream's frames without contact show.
+    """The drift in a stream's frames without contact.
 
     Attributes:
         size: px, rms over the markers of the smooth field, beyond what noise explains; NaN before `FEWEST_FRAMES` frames.
-        certainty: z, standard deviations beyond the noise and a drift that does not matter.
-        roughness: share of the squared mean displacement that no smooth field explains, noise subtracted.
+        certainty: z, standard deviations beyond the noise and a harmless drift.
+        roughness: share of the squared mean displacement that no smooth field explains, after subtracting noise.
     """
 
     size: float
@@ -50,21 +50,22 @@ class Drift(NamedTuple):
 
     @property
     def is_certain(self) -> bool:
-        """Whether it is one, beyond chance."""
+        """Return whether the drift is significant."""
         return self.certainty > LEAST_CERTAINTY and self.roughness < LARGEST_ROUGHNESS
 
 
 class DriftWatch:
-    """The markers' mean displacement over the latest frames in which nothing touches.
+    """The markers' mean displacement over the latest frames without contact.
 
     Args:
-        rest_pixels: `[D, 2]`, the markers at rest; of several views those of the first, then those of the second, and so on.
-        rest_covariance: `[D, 2, 2]` px^2, of the noise frozen in what is taken for rest.
-        seen: `[D]` bool, which markers were seen there.
-        image_sizes: width and height of each view's image. Each has polynomials and a camera's motion of its own.
+        rest_pixels: `[D, 2]`, the markers at rest, px; with several views those of the first, then those of the second, and so
+            on.
+        rest_covariance: covariance of the frozen noise in the rest state, `[D, 2, 2]` px^2.
+        seen: `[D]` bool, which markers were seen at rest.
+        image_sizes: width and height of each view's image; each view has its own polynomials and camera motion.
 
     Limitations:
-        A touch that is too light or too wide for `LARGEST_ROUGHNESS` to tell, held for tens of frames, looks like a drift.
+        A contact held for tens of frames that is too light or too wide to exceed `LARGEST_ROUGHNESS` looks like a drift.
 
     Example:
         >>> u, v = torch.meshgrid(torch.arange(0.0, 100, 10), torch.arange(0.0, 100, 10), indexing="ij")
@@ -92,13 +93,13 @@ class DriftWatch:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Start again."""
         self.frames, self.share, self.square = 0, 0.0, 0.0
         self.mean = torch.zeros(len(self.fields), 2, dtype=torch.float64)
         self.weight = torch.zeros_like(self.mean[:, :1])
 
     def add(self, displacement: Tensor, confidence: Tensor) -> None:
-        """One more frame: the markers' displacement from rest `[D, 2]` px, NaN where lost, and their confidence `[D]`."""
+        """Add a frame: the markers' displacement from rest `[D, 2]` px, NaN where lost, and their confidence `[D]`."""
         moved, found = self._moved(displacement, confidence), (confidence > 0).cpu()[self.seen, None].double()
         self.frames += 1
         gain = 1 / min(self.frames, FRAMES_OF_MEAN)
@@ -108,14 +109,14 @@ class DriftWatch:
         self.share = (1 - gain) ** 2 * self.share + gain**2
 
     def is_near(self, displacement: Tensor, confidence: Tensor) -> bool:
-        """Whether one more frame's markers lie where they have lain so far, as the arguments of `add`."""
+        """Return whether a frame's markers are close to their mean positions so far; arguments as for `add`."""
         if self.frames < FEWEST_FRAMES:
             return False
         return self._size(self._coefficients(self._moved(displacement, confidence) - self.mean)) < NEAR_REST
 
     def is_rigid(self, displacement: Tensor, confidence: Tensor) -> bool:
-        """Whether one frame's markers have moved as a moved camera makes them, beyond noise, and no press; arguments as of
-        `add`. The frame is taken to be as noisy as what is taken for rest."""
+        """Return whether a frame's displacements are explained by a camera motion and noise alone, without contact; arguments
+        as for `add`. The frame's noise is assumed to equal that of the rest state."""
         whitened = self._whitened(self._moved(displacement, confidence)) / 2**0.5
         S = float((whitened @ self.rigid).square().sum())
         terms = self.rigid.shape[1]
@@ -123,7 +124,7 @@ class DriftWatch:
         return (S - terms) / (2 * terms) ** 0.5 > LEAST_CERTAINTY and rough < LARGEST_ROUGHNESS * (rough + S - terms)
 
     def drift(self) -> Drift:
-        """What the frames so far show."""
+        """Return the drift in the frames so far."""
         if self.frames < FEWEST_FRAMES:
             return Drift(float("nan"), 0.0, 0.0)
         coefficients, (D, _, k) = self._coefficients(self.mean), self.fields.shape
@@ -139,16 +140,16 @@ class DriftWatch:
         return Drift(max(0.0, self._size(coefficients) ** 2 - noise) ** 0.5, certainty, roughness)
 
     def _moved(self, displacement: Tensor, confidence: Tensor) -> Tensor:
-        """The displacement of the markers that were seen at rest; lost ones are where they were."""
+        """Return the displacement of the markers seen at rest; for lost ones, the mean so far."""
         found = (confidence > 0).cpu()[self.seen, None]
         return torch.where(found, displacement.detach().cpu().double()[self.seen], self.mean)
 
     def _size(self, coefficients: Tensor) -> float:
-        """Rms of a smooth field, px."""
+        """Return the rms of a smooth field, px."""
         return float((self.fields @ coefficients).square().sum(-1).mean().sqrt())
 
     def _whitened(self, displacement: Tensor) -> Tensor:
-        """`[D, 2]` px to `[2 D]`, in which the frozen noise has the covariance 1."""
+        """Whiten displacements `[D, 2]` px to `[2 D]`, for which the frozen noise has unit covariance."""
         return (self.whitening @ displacement[..., None]).flatten()
 
     def _coefficients(self, displacement: Tensor) -> Tensor:
@@ -156,7 +157,7 @@ class DriftWatch:
 
 
 def _polynomials(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Monomials of `pixels [D, 2]` about the image's centre, over half its longer side, `[D, T]`."""
+    """Return the monomials of `pixels [D, 2]` about the image's centre, over half its longer side, `[D, T]`."""
     order = max(n for n in range(POLYNOMIAL_ORDER + 1) if n == 0 or MARKERS_PER_TERM * (n + 1) * (n + 2) / 2 <= len(pixels))
     size = torch.tensor(image_size, dtype=pixels.dtype)
     u, v = ((2 * pixels - size) / size.max()).unbind(-1)

@@ -1,4 +1,4 @@
-"""What finds a sensor's markers in images: the contract of dots and texture."""
+"""The interface of locators, which find a sensor's markers (dots or texture) in images."""
 
 from typing import NamedTuple, Protocol
 
@@ -10,9 +10,9 @@ class LocatedMarkers(NamedTuple):
     """A sensor's markers in a batch of frames.
 
     Attributes:
-        pixels: `[B, D, 2]` (u right, v down); of a lost marker what its neighbours predict.
-        confidence: `[B, D]` in 0..1; a lost marker has 0.
-        covariance: of the pixels, `[B, D, 2, 2]` px^2: what another image of the same markers would change.
+        pixels: `[B, D, 2]` (u right, v down); for a lost marker, the position that its neighbours predict.
+        confidence: `[B, D]` in 0..1, 0 for a lost marker.
+        covariance: covariance of the pixels over repeated images of the same markers, `[B, D, 2, 2]` px^2.
     """
 
     pixels: Tensor
@@ -21,7 +21,7 @@ class LocatedMarkers(NamedTuple):
 
 
 def isotropic(like: Tensor, noise: float) -> Tensor:
-    """The covariance `[..., 2, 2]` of pixels with the same standard deviation `noise` in u and v, for every entry of `like`.
+    """Return the covariance `[..., 2, 2]` of pixels with standard deviation `noise` in u and v, for every entry of `like`.
 
     Example:
         >>> isotropic(torch.zeros(1), 0.5).tolist()
@@ -32,12 +32,12 @@ def isotropic(like: Tensor, noise: float) -> Tensor:
 
 
 class Locator(Protocol):
-    """Pixels of a sensor's markers in a batch of frames, with a confidence: a `torch.nn.Module` with these members.
+    """The interface of a locator: a `torch.nn.Module` that returns the pixels of a sensor's markers with a confidence.
 
-    Implemented by `DotLocator` and `TextureLocator`; markers found by other means go to `Reconstructor.from_pixels`.
+    It is implemented by `DotLocator` and `TextureLocator`; pass markers found by other means to `Reconstructor.from_pixels`.
 
     Attributes:
-        follows: whether `previous` is used, that is, whether markers are followed from frame to frame.
+        follows: whether `previous` is used, so that markers are followed from frame to frame.
     """
 
     follows: bool
@@ -47,11 +47,11 @@ class Locator(Protocol):
 
         Args:
             images: `[B, 1, H, W]`, grey in 0..1.
-            previous: `[B, D, 2]` pixels in the frames before, NaN where lost; without it, or where `follows` is false,
-                markers are searched for from rest.
+            previous: `[B, D, 2]` pixels in the preceding frames, NaN where lost; without it, or if `follows` is false, the
+                search starts from rest.
         """
         ...
 
     def be_exact(self) -> None:
-        """From now on, tell pixels in double precision, where that means anything: in other runtimes the same."""
+        """Return pixels in double precision from now on, if the locator supports that; in other runtimes they are the same."""
         ...

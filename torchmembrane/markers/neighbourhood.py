@@ -1,4 +1,4 @@
-"""The flow at every marker as its neighbours have it: a robust local affine fit."""
+"""Prediction of the flow at every marker from its neighbours by a robust local affine fit."""
 
 from typing import NamedTuple
 
@@ -11,11 +11,11 @@ from .spacing import neighbours
 
 NEIGHBOURS = 16
 ROBUST_STEPS = 4
-RIDGE = 0.05  # share of the neighbours' spread that damps the affine part of a fit
+RIDGE = 0.05  # damping of the affine part of a fit, over the neighbours' spread
 
 
 class NeighbourFlow(NamedTuple):
-    """The flow at every marker as its neighbours have it, px."""
+    """The flow at every marker as predicted by its neighbours, px."""
 
     flow: Tensor  # [B, D, 2]
     gradient: Tensor  # [B, D, 2, 2], d flow / d rest pixel
@@ -23,23 +23,23 @@ class NeighbourFlow(NamedTuple):
     support: Tensor  # [B, D], share of the neighbours that agree, 0..1
 
     def trust(self, flow: Tensor) -> Tensor:
-        """Confidence `[B, D]` in 0..1 that flow `[B, D, 2]` belongs with its neighbours'."""
+        """Return the confidence `[B, D]` in 0..1 that flow `[B, D, 2]` agrees with the prediction."""
         distance = ((flow - self.flow).square().sum(-1) + 1e-12).sqrt()
         return (2.5 - distance / self.scale).clamp(0, 1) * (self.support > 0.25)
 
 
 class Neighbourhood(nn.Module):
-    """Predict the flow at every marker from its neighbours, itself left out, by a robust local affine fit.
+    """Predict the flow at every marker from its neighbours, without the marker itself, by a robust local affine fit.
 
-    Iteratively reweighted least squares: weights `prior exp(-|offset|^2 / 2 h^2) / (1 + r^2 / s^2)^2` of the residuals `r`,
-    their scale `s` the median residual of the neighbourhood and what noise may explain (Geman-McClure).
+    Iteratively reweighted least squares with weights `prior exp(-|offset|^2 / 2 h^2) / (1 + r^2 / s^2)^2` of the residuals `r`
+    (Geman-McClure); their scale `s` combines the median residual of the neighbourhood and the tolerance for noise.
 
     Args:
-        pixels: rest pixels `[D, 2]` of the markers.
-        anchors: pixels `[A, 2]` on the rim, where nothing moves.
+        pixels: pixels of the markers at rest, `[D, 2]`.
+        anchors: fixed pixels on the rim, `[A, 2]`.
 
     Limitations:
-        Wrong neighbours that are a third of a neighbourhood and agree with one another are believed.
+        The prediction is wrong where a third of the neighbours have wrong flows that agree with one another.
 
     Example:
         >>> pixels = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
@@ -67,12 +67,12 @@ class Neighbourhood(nn.Module):
         self.register_buffer("near", torch.as_tensor(near))
 
     def forward(self, flow: Tensor, weight: Tensor, tolerance: float | Tensor) -> NeighbourFlow:
-        """The flow that a marker's neighbours predict.
+        """Predict the flow of each marker from its neighbours.
 
         Args:
             flow: `[B, D, 2]`, px.
             weight: `[B, D]` in 0..1.
-            tolerance: what noise may explain, px; one number, or one for each marker `[D, 1]`.
+            tolerance: residual that noise may explain, px; one number, or one for each marker `[D, 1]`.
         """
         u = F.pad(flow, (0, 0, 0, self.anchors))[:, self.index]
         prior = F.pad(weight, (0, self.anchors), value=1.0)[:, self.index]
@@ -84,7 +84,8 @@ class Neighbourhood(nn.Module):
         return NeighbourFlow(*fit, scale[..., 0], (prior * (squared < 4 * scale.square())).mean(-1))
 
     def misfit(self, fit: tuple[Tensor, Tensor], u: Tensor, prior: Tensor, tolerance: float | Tensor) -> tuple[Tensor, Tensor]:
-        """Squared residuals `[B, D, k]` of the neighbours, and the scale `[B, D, 1]` up to which they are credible."""
+        """Return the squared residuals `[B, D, k]` of the neighbours, and the scale `[B, D, 1]` up to which they are
+        credible."""
         linear = torch.einsum("bdij,dkj->bdki", fit[1], self.offset)
         squared = (u - fit[0][:, :, None] - linear).square().sum(-1)
         median = (
@@ -94,15 +95,15 @@ class Neighbourhood(nn.Module):
 
 
 def affine_fit(x: Tensor, u: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted affine fit `u ~ flow + gradient x`.
+    """Fit `u ~ flow + gradient x` by weighted least squares.
 
     Args:
-        x: offsets of the neighbours `[..., D, k, 2]`.
-        u: their flow `[..., D, k, 2]`.
-        weight: `[..., D, k]`.
+        x: offsets of the neighbours, `[..., D, k, 2]`.
+        u: flow of the neighbours, `[..., D, k, 2]`.
+        weight: weights of the neighbours, `[..., D, k]`.
 
     Returns:
-        Its value `[..., D, 2]` at x = 0 and gradient `[..., D, 2, 2]`, the latter damped by `RIDGE`.
+        The value `[..., D, 2]` at x = 0 and the gradient `[..., D, 2, 2]`, the latter damped by `RIDGE`.
     """
     total = weight.sum(-1, keepdim=True) + 1e-12
     w = (weight / total)[..., None]
@@ -115,7 +116,7 @@ def affine_fit(x: Tensor, u: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def inverse_2x2(matrix: Tensor) -> Tensor:
-    """Inverse of `[..., 2, 2]` matrices in closed form.
+    """Invert `[..., 2, 2]` matrices in closed form.
 
     Example:
         >>> inverse_2x2(torch.tensor([[2.0, 1.0], [1.0, 1.0]])).tolist()
@@ -127,7 +128,7 @@ def inverse_2x2(matrix: Tensor) -> Tensor:
 
 
 def weighted_median(values: Tensor, weight: Tensor) -> Tensor:
-    """Median over `k` of `values [..., k, C]` with `weight [..., k]`; the smallest value where all weights vanish.
+    """Return the median over `k` of `values [..., k, C]` with `weight [..., k]`; the smallest value if all weights are zero.
 
     Example:
         >>> weighted_median(torch.tensor([[1.0], [9.0], [5.0]]), torch.tensor([1.0, 0.1, 1.0])).tolist()

@@ -1,23 +1,23 @@
-"""How noisy images are."""
+"""Estimation of the noise of images."""
 
 import torch
 from torch import Tensor
 
-STRIDE = 7  # px, between the places that are asked: at every phase of blocks of 8
+STRIDE = 7  # px between the sampled positions, which visit every phase of 8-px blocks
 GAIN = 6  # of the second difference in u of that in v, in noise (Immerkaer 1996)
-EXPOSED = (0.03, 0.97)  # grey in which noise is not cut off
-NO_LIMIT = 100.0  # no difference of grey in 0..1 is as large
+EXPOSED = (0.03, 0.97)  # range of grey in which noise is not clipped
+NO_LIMIT = 100.0  # larger than any difference of grey values in 0..1
 OUTLIER_FACTOR, ROUNDS = 3.0, 4
 BIAS = 0.753  # mean of |x| of what is within OUTLIER_FACTOR times that mean, of a normal x of standard deviation 1
 
 
 def pixel_noise(images: Tensor) -> Tensor:
-    """Standard deviation of the noise of a pixel, `[B]`, from images `[B, 1, H, W]` with edges in them.
+    """Estimate the standard deviation of pixel noise, `[B]`, from images `[B, 1, H, W]` that contain edges.
 
-    The mean size of a second difference that sees neither slopes nor curvatures; edges are cut off as what is far above it.
+    It is the mean magnitude of a second difference that slopes and curvatures do not affect; edges are excluded as outliers.
 
     Limitations:
-        Noise that is not white, as JPEG leaves it, or texture finer than some pixels, is taken for more or less than it is.
+        The estimate is off if the noise is not white, as after JPEG compression, or if texture is only a few pixels wide.
 
     Example:
         >>> noise = torch.randn(1, 1, 200, 200, generator=torch.Generator().manual_seed(0))
@@ -37,6 +37,6 @@ def pixel_noise(images: Tensor) -> Tensor:
 
 
 def _second_difference(images: Tensor, dim: int) -> Tensor:
-    """Along `dim`, at every `STRIDE`-th place."""
+    """Return the second difference along `dim` at every `STRIDE`-th position."""
     before, here, after = (images.movedim(dim, 0)[k : images.shape[dim] + k - 2 : STRIDE] for k in range(3))
     return (before + after).sub(here, alpha=2).movedim(0, dim)

@@ -1,4 +1,4 @@
-"""What the markers show in a batch of images: displacements, confidence, and a status for every frame."""
+"""What a batch of images shows of the markers: displacements, confidence, and a status for each frame."""
 
 from typing import Any, NamedTuple
 
@@ -17,19 +17,19 @@ from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen
 
 LOCATION_NOISE = 0.05
-"""px, standard deviation of a marker in an image where nothing else is known."""
+"""px, assumed standard deviation of a marker's pixel if nothing else is known."""
 MOST_NOISE = 100.0  # px
 FOUND_CONFIDENCE = 0.5
 """Confidence above which a marker counts as found."""
-FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5  # of the markers: fewer found are too few, or an image unlike the rest image
-LARGEST_OFFSET = 0.005  # of the image's diagonal: rms, by which markers at rest may lie off the model's
+FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5  # shares of markers found below which there are too few, or the image is unlike rest
+LARGEST_OFFSET = 0.005  # largest rms distance of the markers at rest from the model's, over the image's diagonal
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
-SATURATION_STRIDE = 4  # px: every so many rows and columns are asked whether they are saturated
+SATURATION_STRIDE = 4  # px between the rows and columns that are tested for saturation
 
 
 class MarkerFlow(NamedTuple):
-    """Of a batch: the markers' `displacement [B, D, 2]` px, their `confidence [B, D]` in 0..1, the displacements' `covariance
-    [B, D, 2, 2]` px^2, `status [B]` so far."""
+    """The markers in a batch: `displacement [B, D, 2]` px, `confidence [B, D]` in 0..1, `covariance [B, D, 2, 2]` px^2 of the
+    displacements, and the preliminary `status [B]`."""
 
     displacement: Tensor
     confidence: Tensor
@@ -38,26 +38,26 @@ class MarkerFlow(NamedTuple):
 
 
 class RestState(NamedTuple):
-    """The markers without contact: `pixels [D, 2]`, and their own noise, `covariance [D, 2, 2]` px^2."""
+    """The markers without contact: `pixels [D, 2]` and the `covariance [D, 2, 2]` px^2 of their noise."""
 
     pixels: Tensor
     covariance: Tensor
 
 
 class MarkerObserver(nn.Module):
-    """Images of one sensor to what its markers show.
+    """Measures the displacements of one sensor's markers in images.
 
     Args:
         markers: the markers on the rest surface, with their locator.
-        rim_pixels: `[R, 2]`, the fixed rim in the rest image, where nothing moves.
-        name: the sensor's, for messages.
+        rim_pixels: pixels of the fixed rim in the rest image, `[R, 2]`.
+        name: name of the sensor, for messages.
         dtype: precision of the pixels.
-        rest_image: `[height, width]` grey, or None: displacements are then from where the model sees the markers.
-        image_size: width and height; what the model has outside is not seen, not lost.
-        check_rest: whether a rest image that disagrees with the model is refused.
+        rest_image: `[height, width]` grey, or None: displacements are then relative to the model's pixels of the markers.
+        image_size: width and height; markers outside according to the model count as not visible, not as lost.
+        check_rest: whether to refuse a rest image that disagrees with the model.
 
     Raises:
-        MembraneError: most markers in view are not found in the rest image, or they lie far from where the model has them.
+        MembraneError: most markers in view are not found in the rest image, or they lie far from their pixels in the model.
     """
 
     rest_pixels: Tensor
@@ -100,7 +100,7 @@ class MarkerObserver(nn.Module):
 
     @property
     def follows(self) -> bool:
-        """Whether markers are looked for first where they were in the frame before."""
+        """Return whether the search for markers starts at their pixels in the preceding frame."""
         return self.locator.follows
 
     def be_exact(self) -> None:
@@ -108,24 +108,24 @@ class MarkerObserver(nn.Module):
         self.locator.be_exact()
 
     def by_view(self, values: Tensor) -> Tensor:
-        """Values `[B, D, ...]` of one view as they are; of several `ViewsObserver` has them `[B, W, D, ...]`."""
+        """Return values `[B, D, ...]` unchanged; `ViewsObserver` returns those of several views as `[B, W, D, ...]`."""
         return values
 
     def sighted(self, values: Tensor) -> Tensor:
-        """The other way round, of `by_view`."""
+        """Undo `by_view`."""
         return values
 
     def seen_by_each(self, values: Tensor) -> Tensor:
-        """Values of the markers for each view that sees them."""
+        """Return values of the markers for each view that sees them."""
         return values
 
     def with_rays(self, pixels: Tensor, confidence: Tensor) -> Tensor:
-        """Pixels `[B, D, 2]` as they are; of several views, `ViewsObserver` has some without a ray."""
+        """Return pixels `[B, D, 2]` unchanged; `ViewsObserver` replaces those without a viewing ray."""
         return pixels
 
     def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor]:
-        """The markers in the rest image, their covariance, which are found: subtracted from every frame's, rest offsets are
-        nulled (5.2)."""
+        """Return the markers in the rest image, their covariance, and which are found; subtracting these pixels from those of
+        every frame cancels offsets at rest (5.2)."""
         with torch.no_grad(), using(is_used() and getattr(self.locator, "is_compiled", True)):
             pixels, confidence, covariance = self.locator(image[None, None])
         found = (
@@ -141,12 +141,12 @@ class MarkerObserver(nn.Module):
         return torch.where(found[0, :, None], pixels[0], self.measured_rest), covariance[0], found[0]
 
     def rest_offset(self) -> float:
-        """Rms distance of the markers in the rest image from where the model has them, px."""
+        """Return the rms distance of the markers in the rest image from their pixels in the model, px."""
         off2 = (self.measured_rest - self.rest_pixels).square().sum(-1)
         return float(off2[self.seen_at_rest].mean().sqrt())
 
     def check_rest(self, name: str) -> None:
-        """Refuse a rest image that disagrees with the model by more than calibration could explain."""
+        """Refuse a rest image that deviates from the model by more than a calibration error could explain."""
         largest = self.largest_offset
         if (offset := self.rest_offset()) > largest:
             raise MembraneError(
@@ -156,11 +156,11 @@ class MarkerObserver(nn.Module):
             )
 
     def rest_of(self, images: Tensor) -> RestState:
-        """The markers in grey images `[B, 1, height, width]` without contact, averaged; those that are found in none keep their
-        places, and their noise, in the sensor's rest image.
+        """Return the mean markers of grey images `[B, 1, height, width]` without contact; markers found in none of them keep
+        their pixels and noise from the sensor's rest image.
 
         Raises:
-            MembraneError: an image that does not show the markers.
+            MembraneError: an image does not show the markers.
         """
         with torch.no_grad():
             displacement, confidence, covariance, status = self.judge(*self(images))
@@ -176,18 +176,19 @@ class MarkerObserver(nn.Module):
         )
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
+        """Return the pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which are found,
+        `[B, D]`."""
         with torch.no_grad():
             pixels, confidence, _ = self.locator(images)
         return pixels, confidence > FOUND_CONFIDENCE
 
     def forward(self, images: Tensor, previous: Tensor | None = None, rest_pixels: Tensor | None = None) -> MarkerFlow:
-        """What grey images `[B, 1, height, width]` show.
+        """Measure the markers in grey images `[B, 1, height, width]`.
 
         Args:
-            images: in 0..1.
-            previous: `[B, D, 2]`, `pixels` of the frames before, from which dots are followed where that is possible.
-            rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the rest image.
+            images: grey values in 0..1.
+            previous: `[B, D, 2]`, `pixels` of the preceding frames, from which dots are followed if the locator can do so.
+            rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: those in the rest image.
         """
         status = self.check(images)
         before = None if previous is None else self.located(previous)
@@ -195,7 +196,7 @@ class MarkerObserver(nn.Module):
 
     @traced
     def check(self, images: Tensor) -> Tensor:
-        """Status `[B]` of images."""
+        """Return the status `[B]` of images."""
         flat, sparse = images.flatten(1), images[..., ::SATURATION_STRIDE, ::SATURATION_STRIDE]
         mean, low, high = flat.mean(1), flat.amin(1), flat.amax(1)
         bad = ~((mean < torch.inf) & (low > -1e-3) & (high < 1.001))  # one value that is not finite makes the mean so
@@ -205,15 +206,15 @@ class MarkerObserver(nn.Module):
 
     @traced
     def located(self, pixels: Tensor) -> Tensor:
-        """`pixels` of a result as the locator found them."""
+        """Convert the `pixels` of a result back to pixels as the locator found them."""
         return pixels - self.rest_pixels + self.measured_rest
 
     @traced
     def displaced(
         self, pixels: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor, rest_pixels: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Displacements, confidence and covariance from what the locator makes of images; nothing where these hold bad
-        values."""
+        """Return displacements, confidence and covariance from the locator's output; frames with invalid values count as
+        empty."""
         bad = (status == Status.BAD_VALUES.value)[:, None]
         rest = self.measured_rest if rest_pixels is None else rest_pixels
         displacement, confidence = (pixels - rest).masked_fill(bad[..., None], 0.0), confidence.masked_fill(bad, 0.0)
@@ -222,7 +223,7 @@ class MarkerObserver(nn.Module):
     def from_pixels(
         self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None, noise: float | None = None
     ) -> MarkerFlow:
-        """What markers located elsewhere show, those that belong with no neighbour without confidence.
+        """Return the displacements of markers located elsewhere; those that contradict their neighbours get confidence 0.
 
         Arguments and errors as for `Reconstructor.from_pixels`.
         """
@@ -232,7 +233,7 @@ class MarkerObserver(nn.Module):
     def as_given(
         self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None, noise: float | None
     ) -> MarkerFlow:
-        """As `from_pixels`, each marker with the confidence that is given."""
+        """Do the same as `from_pixels`, but keep the given confidence of each marker."""
         pixels = tensor_of("from_pixels: pixels", pixels).to(self.rest_pixels)
         pixels = pixels[None] if pixels.ndim == 2 else pixels
         if pixels.shape[1:] != self.rest_pixels.shape:
@@ -247,22 +248,23 @@ class MarkerObserver(nn.Module):
         return MarkerFlow(displacement, confidence, self.covariance_of(noise, confidence), status)
 
     def covariance_of(self, noise: float | None, confidence: Tensor) -> Tensor:
-        """Of displacements `[B, D, 2, 2]` px^2 between pixels located elsewhere, now and at rest, each with this standard
-        deviation in u and v, px; default: `LOCATION_NOISE` now, and what the markers of the rest image have."""
+        """Return the covariance `[B, D, 2, 2]` px^2 of displacements between pixels located elsewhere, now and at rest, each
+        with this standard deviation in u and v, px. By default it is `LOCATION_NOISE` now, and that of the rest image's markers
+        at rest."""
         if noise is None:
             return self.rest_covariance + isotropic(confidence, LOCATION_NOISE)
         expect(0 < noise < MOST_NOISE, "noise of pixels", noise, f"more than 0 and less than {MOST_NOISE:g} px")
         return isotropic(confidence, 2**0.5 * noise)
 
     def rest_given(self, rest_pixels: Any) -> Tensor:
-        """The markers at rest as a caller gives them, `[D, 2]` px."""
+        """Check the markers at rest given by a caller, and return them as `[D, 2]` px."""
         rest = tensor_of("rest_pixels", rest_pixels).to(self.rest_pixels)
         if rest.shape != self.rest_pixels.shape:
             raise MembraneError(f"rest_pixels {list(rest.shape)}; expected {list(self.rest_pixels.shape)}, one for each marker")
         return rest
 
     def before(self, previous: Any, frames: int) -> Tensor:
-        """Pixels `[B, D, 2]` of a previous result, refused where it cannot be one of these frames'."""
+        """Return the pixels `[B, D, 2]` of a previous result, after checking that it fits these frames."""
         given, expected = getattr(previous, "pixels", None), [frames, *self.rest_pixels.shape]
         came = f"pixels {list(given.shape)}" if isinstance(given, Tensor) else f"no pixels, it is a {type(previous).__name__}"
         if not isinstance(given, Tensor) or list(given.shape) != expected:
@@ -271,7 +273,7 @@ class MarkerObserver(nn.Module):
 
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
-        """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
+        """Return displacements, zero in unusable frames, confidence, zero for lost markers, covariance, and status."""
         found = confidence > FOUND_CONFIDENCE
         count, D = found.sum(-1), self.seen_at_rest.sum().float()
         unlike = Status.UNLIKE_REST.value * (count < ALIKE_SHARE * D).to(torch.int64)

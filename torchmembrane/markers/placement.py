@@ -1,4 +1,4 @@
-"""Markers on the rest surface, and what locates them in an image: built once for a sensor."""
+"""Placement of markers on the rest surface, and choice of their locator; done once for each sensor."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,13 +26,13 @@ from .texture.patches import choose_patches
 LOCATORS = ("fit", "soft")
 FEWEST_MARKERS = 8
 GRAZING = 0.1
-"""Cosine between a line of sight and the normal below which a marker is not seen."""
+"""Cosine between a line of sight and the normal below which a marker is not visible."""
 BEHIND = 0.02
-"""How far behind the surface a marker of the list may lie, over its size, and be on it."""
+"""Depth behind the surface, over its size, up to which a listed marker counts as on the surface."""
 SMOOTH_GRID = 33
-"""Vertices per side of the surface on which markers are placed: the solver's facets are too coarse for oblique rays."""
+"""Vertices per side of the surface for marker placement: the solver's facets are too coarse for oblique rays."""
 DOT_RADIUS = (0.16, 0.27)
-"""Radius of small and large dots over the dot spacing, where no rest image shows it."""
+"""Radius of small and large dots over their spacing, if there is no rest image to measure them in."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class PlacedMarkers:
 
     Attributes:
         positions: `[D, 3]`, length unit, camera frame.
-        model_pixels: `[D, 2]`, where the camera model projects them, or their tips where they stand off the surface.
-        points: the same as points of the membrane's triangles.
-        in_view: `[D]` bool, which of them reach into the image at rest.
-        locator: finds them in images.
-        levers: `[D, 3]`, from the positions to the tips; None: all lie on the surface.
+        model_pixels: `[D, 2]`, pixels of the markers, or of their tips if they stand off the surface, in the camera model.
+        points: the same markers as points of the membrane's triangles.
+        in_view: `[D]` bool, whether at least a part of each lies in the image at rest.
+        locator: locator of the markers in images.
+        levers: `[D, 3]`, vectors from the positions to the tips; None: all markers lie on the surface.
     """
 
     positions: np.ndarray
@@ -57,15 +57,15 @@ class PlacedMarkers:
 
 
 def imaged_vertices(sensor: Sensor, vertex_pixels: Tensor, whole: bool) -> Tensor:
-    """Which vertices the camera can image, `[V]` bool; refused where some cannot be imaged that must.
+    """Return which vertices the camera can image, `[V]` bool; raise an error if a required one is not among them.
 
     Args:
-        sensor: with a list of dots or a rest image.
-        vertex_pixels: rest pixels `[V, 2]` of the grid's vertices.
-        whole: whether the estimator needs all of them.
+        sensor: a sensor with a list of dots or a rest image.
+        vertex_pixels: pixels of the grid's vertices at rest, `[V, 2]`.
+        whole: whether the estimator requires all vertices.
 
     Raises:
-        MembraneError: a vertex that is needed cannot be imaged.
+        MembraneError: a required vertex cannot be imaged.
     """
     imaged = torch.isfinite(vertex_pixels).all(-1)
     if not (imaged.all() if whole or sensor.markers.positions is None else imaged.any()):
@@ -80,12 +80,12 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
     """Place the sensor's markers: listed dots, dots found in the rest image, or texture patches chosen there.
 
     Args:
-        sensor: with a list of dots or a rest image.
-        vertex_pixels: rest pixels `[V, 2]` of the grid's vertices.
-        locator: how they are found in images: "fit", by least squares, or "soft", by soft-argmax of responses.
+        sensor: a sensor with a list of dots or a rest image.
+        vertex_pixels: pixels of the grid's vertices at rest, `[V, 2]`.
+        locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of filter responses.
 
     Raises:
-        MembraneError: an unknown locator, or too few markers are found.
+        MembraneError: the locator is unknown, or too few markers are found.
     """
     of_dots, of_texture = _locators(locator)
     anchors = vertex_pixels[sensor.membrane.fixed].numpy()
@@ -118,7 +118,7 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
 
 
 def listed_levers(sensor: Sensor) -> np.ndarray | None:
-    """From a sensor's listed dots to their tips, at rest, `[D, 3]`; None where all lie on the surface."""
+    """Return the vectors from a sensor's listed dots to their tips at rest, `[D, 3]`; None if all dots lie on the surface."""
     markers = sensor.markers
     if markers.positions is None or not markers.stand_off:
         return None
@@ -133,12 +133,12 @@ def _smooth_surface(sensor: Sensor) -> Membrane:
 
 
 def _tips(positions: np.ndarray, levers: np.ndarray | None) -> np.ndarray:
-    """What the camera sees of markers, `[D, 3]`."""
+    """Return the points of the markers that the camera sees, `[D, 3]`."""
     return positions if levers is None else positions + levers
 
 
 def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]]:
-    """What locates dots and what locates texture."""
+    """Return the locators of dots and of texture."""
     if name == "fit":
         return DotLocator, TextureLocator
     if name == "soft":
@@ -149,7 +149,7 @@ def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]
 
 
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
-    """Where the camera sees `positions [D, 3]`; what it cannot image lies far outside, each point elsewhere."""
+    """Return the pixels of `positions [D, 3]`; points that cannot be imaged get distinct pixels far outside the image."""
     pixels = sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
     outside = -float(max(sensor.camera.image_size)) * (2 + np.arange(len(pixels)))
     seen = np.isfinite(pixels).all(1) & visible(sensor, positions)
@@ -157,8 +157,8 @@ def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
 
 
 def visible(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
-    """Which of `positions [D, 3]` on the rest surface turn to the camera and are not behind another part of it, `[D]` bool: all
-    of a sensor with one view, whose camera sees all of its membrane."""
+    """Return which of `positions [D, 3]` on the rest surface face the camera and are not occluded by another part of the
+    surface, `[D]` bool. For a sensor with one view these are all, because its camera sees the whole membrane."""
     if not isinstance(sensor.surface, SurfaceInView):
         return np.ones(len(positions), bool)
     membrane, distance = sensor.membrane, np.linalg.norm(positions, axis=1)
@@ -171,8 +171,8 @@ def visible(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
 
 
 def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """The markers `[M, 3]` whose tips are where the rays of `pixels [D, 2]` in the rest image first meet the surface of all
-    tips; their levers `[M, 3]`, None where that is the rest surface; and which of the rays meet it, `[D]` bool."""
+    """Return the markers `[M, 3]` whose tips lie where the rays of `pixels [D, 2]` in the rest image first meet the surface of
+    all tips; their levers `[M, 3]`, or None if that is the rest surface; and which rays meet it, `[D]` bool."""
     rays = sensor.camera.pixel_to_ray(torch.from_numpy(pixels))
     smooth = _smooth_surface(sensor)
     X, height = smooth.rest.numpy(), float(sensor.markers.height)
@@ -189,10 +189,10 @@ def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, n
 
 
 def markers_in_view(sensor: Sensor) -> np.ndarray:
-    """Which of a sensor's listed dots its camera sees at rest, `[D]` bool.
+    """Return which of a sensor's listed dots its camera sees at rest, `[D]` bool.
 
     Args:
-        sensor: with listed dots; one view of several as `Sensor.in_view` gives it.
+        sensor: a sensor with listed dots; one of several views is selected by `Sensor.in_view`.
 
     Example:
         >>> from torchmembrane.presets import preset
@@ -204,14 +204,14 @@ def markers_in_view(sensor: Sensor) -> np.ndarray:
 
 
 def refuse_blind(sensor: Sensor, name: str) -> None:
-    """Refuse a view that sees too few of the listed dots at rest.
+    """Raise an error if a view sees too few of the listed dots at rest.
 
     Args:
-        sensor: of this view, as `Sensor.in_view` gives it.
-        name: of sensor and view, for the message.
+        sensor: the sensor in this view, as returned by `Sensor.in_view`.
+        name: name of sensor and view, for the message.
 
     Raises:
-        MembraneError: says how many are seen, and the remedy.
+        MembraneError: too few dots are visible; the message says how many.
     """
     seen = markers_in_view(sensor)
     if seen.sum() < FEWEST_MARKERS:
@@ -222,7 +222,7 @@ def refuse_blind(sensor: Sensor, name: str) -> None:
 
 
 def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:
-    """The dots of the sensor's list, measured in the rest image where there is one."""
+    """Return the pattern of the listed dots, measured in the rest image if there is one."""
     markers, pixels = sensor.markers, _model_pixels(sensor, positions)
     sizes = np.array([int(size == "large") for size in markers.sizes or ()], dtype=int)
     shapes = _unit_dot_shapes(sensor, positions)
@@ -238,7 +238,7 @@ def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:
 
 
 def _unit_dot_shapes(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
-    """How a dot of radius 1 in the surface's tangent plane is imaged: `[D, 2, 2]`, px per length unit."""
+    """Return the image of a dot of radius 1 in the surface's tangent plane: `[D, 2, 2]`, px per length unit."""
     points = sensor.membrane.closest_points(positions)
     normals = (sensor.membrane.rest_normals.numpy()[points.vertices] * points.weights[..., None]).sum(1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -251,11 +251,11 @@ def _unit_dot_shapes(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
 
 
 def rim_mask(sensor: Sensor, vertex_pixels: Tensor) -> np.ndarray:
-    """Pixels inside the rim's outline.
+    """Return which pixels lie inside the outline of the rim.
 
     Args:
-        sensor: its camera's image size and the membrane's grid are used.
-        vertex_pixels: rest pixels `[V, 2]` of the grid's vertices.
+        sensor: sensor whose image size and grid are used.
+        vertex_pixels: pixels of the grid's vertices at rest, `[V, 2]`.
 
     Returns:
         `[height, width]` bool.

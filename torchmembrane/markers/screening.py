@@ -1,4 +1,4 @@
-"""Wrong matches: markers whose displacement does not belong with their neighbours'."""
+"""Detection of wrong matches: markers whose displacement contradicts that of their neighbours."""
 
 import numpy as np
 import torch
@@ -8,23 +8,24 @@ from ..errors import MembraneError
 from .neighbourhood import Neighbourhood
 from .spacing import spacing
 
-TOLERANCE = 0.2  # of the distance to the nearest marker: what a press may put between a displacement and its neighbours' fit
+TOLERANCE = 0.2  # largest deviation from the neighbours' fit that a press causes, over the distance to the nearest marker
 FEWEST_NEIGHBOURS = 6
 
 
 class MismatchScreen(nn.Module):
-    """Trust in matched markers: 1 where a robust local affine fit to its neighbours bears a displacement out, 0 where not.
+    """Trust in matched markers: 1 where a robust local affine fit to the neighbours confirms a displacement, 0 where it does
+    not.
 
     Args:
-        pixels: rest pixels `[D, 2]` of the markers.
-        anchors: pixels `[A, 2]` on the rim, where nothing moves.
+        pixels: pixels of the markers at rest, `[D, 2]`.
+        anchors: fixed pixels on the rim, `[A, 2]`.
 
     Raises:
-        MembraneError: fewer than 6 markers.
+        MembraneError: there are fewer than 6 markers.
 
     Limitations:
-        Wrong where a third of a neighbourhood, or all of it alike, is mismatched, and where the flow has a step of more
-        than a fifth of the spacing (a fold).
+        The result is wrong where a third of a neighbourhood is mismatched, or all of it in the same way, and where the flow has
+        a step of more than a fifth of the spacing (a fold).
 
     Example:
         >>> pixels = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
@@ -46,14 +47,14 @@ class MismatchScreen(nn.Module):
         self.register_buffer("tolerance", torch.from_numpy(TOLERANCE * spacing(pixels)[0])[:, None])
 
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
-        """The confidence times the trust in each marker.
+        """Return the confidence of each marker multiplied by the trust in it.
 
         Args:
             displacement: `[B, D, 2]`, px.
-            confidence: `[B, D]` in 0..1, 0 = lost.
+            confidence: `[B, D]` in 0..1, 0 for lost markers.
 
         Returns:
-            `[B, D]` in 0..1; below 0.5 a marker is taken for mismatched.
+            `[B, D]` in 0..1; a marker below 0.5 is considered mismatched.
         """
         flow = torch.where(confidence[..., None] > 0, displacement, 0.0)
         return confidence * self.neighbourhood(flow, confidence, self.tolerance).trust(flow)

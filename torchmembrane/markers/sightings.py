@@ -1,4 +1,4 @@
-"""How a sensor's markers are seen: by its camera, or by each of its views; what a `Reconstructor` is built from."""
+"""How a sensor's markers are seen, by one camera or by several views; a `Reconstructor` is built from this."""
 
 import copy
 from typing import NamedTuple
@@ -18,17 +18,17 @@ from .views import ViewsObserver
 
 
 class Sightings(NamedTuple):
-    """A sensor's markers as they are seen, N times: D markers in each of W views, `N = W D`, the first view's first.
+    """All views of a sensor's markers: D markers in each of W views give `N = W D` sightings, the first view's first.
 
     Attributes:
-        observer: finds them in images.
-        camera: what sees them: the `Camera`, or a `Rig` of several views.
+        observer: finds the markers in images.
+        camera: the `Camera`, or a `Rig` of several views.
         markers: the D markers on the rest surface, with the first view's locator.
         positions: `[N, 3]` at rest, length unit.
-        points: the same N as points of the membrane's triangles.
-        rest_pixels: `[N, 2]`, where the model sees them; of several views the principal point where one does not.
-        vertex_pixels: `[V, 2]`, where the first view sees the grid's vertices.
-        levers: `[N, 3]`, from the positions to the tips that are seen; None: all markers lie on the surface.
+        points: the same N markers as points of the membrane's triangles.
+        rest_pixels: `[N, 2]`, the model's pixels of the markers at rest; the principal point for a view that does not see one.
+        vertex_pixels: `[V, 2]`, pixels of the grid's vertices in the first view.
+        levers: `[N, 3]`, vectors from the positions to the visible tips; None: all markers lie on the surface.
     """
 
     observer: MarkerObserver | ViewsObserver
@@ -42,17 +42,17 @@ class Sightings(NamedTuple):
 
 
 def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, check_rest: bool) -> Sightings:
-    """The sightings of a sensor's markers.
+    """Return the sightings of a sensor's markers.
 
     Args:
         sensor: the sensor.
         locator: how markers are found in images, "fit" or "soft".
         dtype: precision of the pixels.
         whole: whether every vertex must be imaged.
-        check_rest: whether a rest image that disagrees with the model is refused.
+        check_rest: whether to refuse a rest image that disagrees with the model.
 
     Raises:
-        MembraneError: too few markers are seen, or not where the model has them.
+        MembraneError: too few markers are seen, or they lie far from their pixels in the model.
     """
     observer, markers, vertex_pixels = _of_one_view(sensor.in_view(0), sensor.name, locator, dtype, whole, check_rest)
     positions, rest_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
@@ -80,7 +80,7 @@ def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, che
 def _of_one_view(
     sensor: Sensor, name: str, locator: str, dtype: torch.dtype, whole: bool, check_rest: bool
 ) -> tuple[MarkerObserver, PlacedMarkers, Tensor]:
-    """Observer and markers of a sensor with one view, and its rest pixels of the vertices."""
+    """Return the observer and markers of a sensor with one view, and the pixels of the vertices at rest."""
     vertex_pixels = sensor.camera.point_to_pixel(sensor.membrane.rest)
     imaged = imaged_vertices(sensor, vertex_pixels, whole)
     if isinstance(sensor.surface, SurfaceInView):

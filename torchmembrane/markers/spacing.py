@@ -1,15 +1,15 @@
-"""How far apart markers are, and which are next to one another."""
+"""Distances between markers, and their nearest neighbours."""
 
 import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 FADED = 30.0
-"""Exponent of a weight that no longer counts; products with subnormal numbers take fifty times as long."""
+"""Exponent below which a weight is set to zero; products with subnormal numbers take fifty times as long."""
 
 
 def faded(exponent: np.ndarray) -> np.ndarray:
-    """`exp(exponent)`, 0 where it no longer counts.
+    """Return `exp(exponent)`, or 0 where it is negligible.
 
     Example:
         >>> faded(np.array([0.0, -40.0])).tolist()
@@ -19,13 +19,13 @@ def faded(exponent: np.ndarray) -> np.ndarray:
 
 
 def spacing(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The local spacing of markers.
+    """Return the local spacing of markers.
 
     Args:
         pixels: marker centres `[D, 2]`, px.
 
     Returns:
-        Distance of each marker to its nearest neighbour `[D]` and the mean over its four nearest `[D]`, px.
+        The distance of each marker to its nearest neighbour `[D]`, and the mean distance to its four nearest `[D]`, px.
 
     Example:
         >>> nearest, mean = spacing(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]]))
@@ -37,11 +37,11 @@ def spacing(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def neighbours(points: np.ndarray, count: int) -> np.ndarray:
-    """The points nearest to each of `points`, itself left out.
+    """Return the nearest neighbours of each of `points`, without the point itself.
 
     Args:
         points: `[N, 2]` or `[N, 3]`.
-        count: how many neighbours are wanted; fewer where there are no more points.
+        count: number of neighbours; fewer if there are not enough points.
 
     Returns:
         Indices `[N, count]`, the nearest first.
@@ -54,7 +54,7 @@ def neighbours(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-    """Which of `pixels [D, 2]` lie in an image of that width and height, `[D]` bool.
+    """Return which of `pixels [D, 2]` lie in an image of this width and height, `[D]` bool.
 
     Example:
         >>> in_view(np.array([[0.0, 479.0], [640.0, 3.0], [np.nan, 3.0]]), (640, 480)).tolist()
@@ -64,7 +64,7 @@ def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
 
 
 def partly_in_view(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-    """Which dots reach into an image of that width and height, `[D]` bool, also where the border cuts off a part of them.
+    """Return which dots lie at least partly in an image of this width and height, `[D]` bool.
 
     Args:
         pixels: centres `[D, 2]`, px.
@@ -81,7 +81,7 @@ def partly_in_view(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int
 
 
 def thin_out(points: np.ndarray, gap: float) -> np.ndarray:
-    """Every point of `points [N, 2]` farther than `gap` from those kept before it: `[M, 2]`."""
+    """Keep each point of `points [N, 2]` that is farther than `gap` from those kept before it: `[M, 2]`."""
     kept: list[np.ndarray] = []
     for point in points:
         if all(np.hypot(*(point - other)) > gap for other in kept):
@@ -90,10 +90,10 @@ def thin_out(points: np.ndarray, gap: float) -> np.ndarray:
 
 
 def square_distance(x: Tensor, y: Tensor) -> Tensor:
-    """`[..., K, D]` between the points `x [..., K, 2]` and `y [..., D, 2]`."""
+    """Return the squared distances `[..., K, D]` between points `x [..., K, 2]` and `y [..., D, 2]`."""
     return (x.square().sum(-1)[..., None] + y.square().sum(-1)[..., None, :]).sub(x @ y.mT, alpha=2).clamp_min(0)
 
 
 def safe_length(x: Tensor, dim: int) -> Tensor:
-    """Length of the vectors along `dim`, at least 1e-6: its gradient is finite also where the vector vanishes."""
+    """Return the length of vectors along `dim`, at least 1e-6, so that its gradient is finite even at zero."""
     return x.square().sum(dim).clamp_min(1e-12).sqrt()
