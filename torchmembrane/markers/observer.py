@@ -213,8 +213,8 @@ class MarkerObserver(nn.Module):
     def displaced(
         self, pixels: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor, rest_pixels: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return displacements, confidence and covariance from the locator's output; frames with invalid values count as
-        empty."""
+        """Return displacements, confidence and covariance from the locator's output; displacements and
+        confidence are zero in frames with invalid values."""
         bad = (status == Status.BAD_VALUES.value)[:, None]
         rest = self.measured_rest if rest_pixels is None else rest_pixels
         displacement, confidence = (pixels - rest).masked_fill(bad[..., None], 0.0), confidence.masked_fill(bad, 0.0)

@@ -1,6 +1,6 @@
-"""The forward problem: a membrane pressed by rigid indenters, and the images that its camera takes of it.
+"""The forward problem: a membrane pressed by rigid indenters, and its camera's images of it.
 
-A sensor's own simulator shares no solver with the estimators and stands on a finer grid than theirs.
+The simulator of a sensor shares no solver with the estimators and uses a finer grid than they do.
 
 Example:
     >>> from torchmembrane import simulate

@@ -14,8 +14,8 @@ from ..errors import MembraneError, check_arguments
 from ..surface.membrane import Membrane
 
 LIGHTS, LIGHT_RADIUS = 4, 0.3  # default lights around the camera's centre, radius over the rim's mean distance from the axis
-LIGHT_WITHIN = 0.5  # at most so far from the camera, over the membrane's least distance from it
-BRIGHT = 0.95  # the quantile of the rest surface that is exposed as asked
+LIGHT_WITHIN = 0.5  # largest distance of the lights from the camera, over the membrane's smallest distance from it
+BRIGHT = 0.95  # quantile of the rest surface's brightness that equals `exposure`
 RANGES = {
     "exposure": (0, math.inf),
     "ambient": (0, 1),
@@ -31,19 +31,19 @@ RANGES = {
 @check_arguments
 @dataclass(frozen=True)
 class Appearance:
-    """Lighting, lens and image sensor of a rendered image.
+    """Lighting, lens and image sensor of rendered images.
 
     Args:
-        lights: positions `(x, y, z)` of point lights, length unit, camera frame; default: four around the camera, within the
+        lights: positions `(x, y, z)` of point lights, length unit, camera frame; default: four around the camera, inside the
             membrane.
-        exposure: grey of the white membrane at rest where it is bright (95 % of it is darker).
-        ambient: share of the light that comes from everywhere.
-        highlight: specular over diffuse light (Blinn-Phong), 0 for a mat membrane.
+        exposure: grey value of a bright part of the white membrane at rest (95 % of the membrane is darker).
+        ambient: share of the light that is ambient.
+        highlight: ratio of specular to diffuse light (Blinn-Phong), 0 for a matt membrane.
         shininess: exponent of the highlights.
-        vignetting: light lost in the image's corners: `1 - vignetting (r / r_corner)^2`.
+        vignetting: loss of light in the image's corners, in `1 - vignetting (r / r_corner)^2`.
         blur: standard deviation of the defocus, px.
-        outside: grey of what is not membrane.
-        noise: white over the noise's standard deviation, dB; None: no noise.
+        outside: grey value outside the membrane.
+        noise: ratio of white to the noise's standard deviation, dB; None: no noise.
 
     Raises:
         MembraneError: a value is outside its range.
@@ -70,7 +70,7 @@ class Appearance:
                 raise MembraneError(f"Appearance: {name} = {value}; expected a number from {low} to {high}")
 
     def lights_for(self, membrane: Membrane) -> Tensor:
-        """Positions `[L, 3]` of the lights in a sensor with this membrane."""
+        """Return the positions `[L, 3]` of the lights in a sensor with this membrane."""
         if self.lights is not None:
             return torch.from_numpy(np.array(self.lights, dtype=float).reshape(-1, 3))
         rest = membrane.rest
@@ -84,15 +84,15 @@ DEFAULT_APPEARANCE = Appearance()
 
 
 def diffuse_light(x: Tensor, inward: Tensor, lights: Tensor) -> Tensor:
-    """Lambert's law, `sum_l max(0, n . l) / |x - x_l|^2`.
+    """Return the diffuse light by Lambert's law, `sum_l max(0, n . l) / |x - x_l|^2`.
 
     Args:
         x: points of the surface, `[..., V, 3]`.
         inward: unit normals there, towards the camera, `[..., V, 3]`.
-        lights: `[L, 3]`.
+        lights: positions of the lights, `[L, 3]`.
 
     Returns:
-        Light, `[..., V]`.
+        The light at the points, `[..., V]`.
 
     Example:
         >>> diffuse_light(torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.0, 0, -1]]), torch.zeros(1, 3))
@@ -104,16 +104,16 @@ def diffuse_light(x: Tensor, inward: Tensor, lights: Tensor) -> Tensor:
 
 
 def specular_light(x: Tensor, inward: Tensor, lights: Tensor, shininess: float) -> Tensor:
-    """Blinn-Phong, `sum_l max(0, n . h)^shininess / |x - x_l|^2` with h halfway from light to camera.
+    """Return the Blinn-Phong highlights, `sum_l max(0, n . h)^shininess / |x - x_l|^2`, with h halfway from light to camera.
 
     Args:
         x: points of the surface, `[..., V, 3]`.
         inward: unit normals there, towards the camera, `[..., V, 3]`.
-        lights: `[L, 3]`.
-        shininess: the exponent.
+        lights: positions of the lights, `[L, 3]`.
+        shininess: exponent of the highlights.
 
     Returns:
-        Light, `[..., V]`.
+        The light at the points, `[..., V]`.
     """
     ray = lights - x[..., None, :]
     square = (ray * ray).sum(-1)
@@ -122,7 +122,7 @@ def specular_light(x: Tensor, inward: Tensor, lights: Tensor, shininess: float) 
 
 
 def vignette(pixels: Tensor, camera: Camera, vignetting: float) -> Tensor:
-    """`1 - vignetting (r / r_corner)^2` with r from the principal point, `[..., 2]` to `[...]`; never below 0."""
+    """Return `1 - vignetting (r / r_corner)^2`, at least 0, at pixels `[..., 2]`; r is measured from the principal point."""
     size = pixels.new_tensor(camera.image_size)
     centre: Tensor = camera.centre.to(pixels)
     corner = torch.maximum(centre + 0.5, size - 0.5 - centre).square().sum()
@@ -130,7 +130,7 @@ def vignette(pixels: Tensor, camera: Camera, vignetting: float) -> Tensor:
 
 
 def blurred(images: Tensor, sigma: float) -> Tensor:
-    """Images `[..., H, W]` under a Gaussian of standard deviation `sigma` px, cut off at 4 sigma; edges are repeated.
+    """Blur images `[..., H, W]` by a Gaussian of standard deviation `sigma` px, cut off at 4 sigma; edges are repeated.
 
     Example:
         >>> bool(torch.allclose(blurred(torch.ones(1, 5, 5), 0.6), torch.ones(1, 5, 5)))
@@ -148,7 +148,7 @@ def blurred(images: Tensor, sigma: float) -> Tensor:
 
 
 def noisy(images: Tensor, decibel: float | None, rng: np.random.Generator) -> Tensor:
-    """Images with Gaussian noise, its standard deviation `decibel` below white, within 0..1; `None` adds none.
+    """Add Gaussian noise with a standard deviation `decibel` below white to images, within 0..1; `None` adds none.
 
     Example:
         >>> image = noisy(torch.full((100, 100), 0.5), 40.0, np.random.default_rng(0))

@@ -17,24 +17,24 @@ from .indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge, facing
 from .simulator import SimulatedFrame, Simulator, Stroke
 
 ATTEMPTS = 10
-RADIUS = (0.06, 0.25)  # of spheres and cylinders, over the square root of the rest area; evenly in the logarithm
+RADIUS = (0.06, 0.25)  # of spheres and cylinders, over the square root of the rest area; log-uniform
 EDGE = (0.02, 0.05)  # of edges' rounding
 SIDE = (0.15, 0.4)  # of a box
 DEPTH = (0.01, 0.1)
-OFF_RIM = 0.15  # least distance from the rim of the point that is aimed at
-TILT = 20.0  # degrees, between the motion and the normal there, at most
+OFF_RIM = 0.15  # smallest distance of the target point from the rim
+TILT = 20.0  # degrees, largest angle between the motion and the normal at the target point
 KINDS = ("sphere", "cylinder", "wedge", "box", "plane")
 NO_SLIDE = np.zeros(3)
 
 
 class Plan(NamedTuple):
-    """The settings that the presses of a data set share.
+    """The settings that all presses of a data set share.
 
     Attributes:
         kinds: kinds of indenters, some of `KINDS`.
         friction: Coulomb's coefficient.
         seed: seed of presses and noise.
-        increment: longest travel in a step, length unit; None: as of `presses`.
+        increment: longest travel in a step, length unit; None: the default of `presses`.
 
     Example:
         >>> Plan(kinds=("sphere",), seed=1).friction
@@ -48,12 +48,12 @@ class Plan(NamedTuple):
 
 
 class DatasetOutcome(NamedTuple):
-    """Numbers of frames of a data set that were made, failed, or existed already.
+    """Numbers of frames of a data set that were made, failed, or existed before.
 
     Attributes:
-        made: now.
-        failed: now.
-        skipped: there before.
+        made: number of frames made by this call.
+        failed: number of frames that failed in this call.
+        skipped: number of frames that existed before.
     """
 
     made: int
@@ -62,10 +62,10 @@ class DatasetOutcome(NamedTuple):
 
 
 def random_frame(simulator: Simulator, plan: Plan, number: int) -> SimulatedFrame:
-    """The frame of a data set with the given number. Strokes that the membrane cannot follow are drawn again.
+    """Simulate the frame of a data set with the given number; strokes that the membrane cannot follow are drawn again.
 
     Raises:
-        MembraneError: none of `ATTEMPTS` strokes could be followed.
+        MembraneError: the membrane could follow none of `ATTEMPTS` strokes.
     """
     rng = np.random.default_rng([plan.seed, number])
     for _ in range(ATTEMPTS):
@@ -80,16 +80,16 @@ def random_frame(simulator: Simulator, plan: Plan, number: int) -> SimulatedFram
 
 
 def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator, seen: np.ndarray | None = None) -> Stroke:
-    """A stroke towards a point of the surface off its rim, even in area, and tilted against the normal there.
+    """Draw a random stroke towards a point of the surface away from its rim, uniform in area, and tilted against the normal.
 
     Args:
-        simulator: whose membrane is pressed.
-        plan: kinds of bodies, friction.
-        rng: that draws it.
-        seen: `[V]` bool, the vertices that may be aimed at; default: all.
+        simulator: simulator of the sensor whose membrane is pressed.
+        plan: settings, of which the kinds of bodies and the friction are used.
+        rng: random generator.
+        seen: `[V]` bool, the vertices that may be target points; default: all.
 
     Raises:
-        MembraneError: no such point is off the rim, or the body does not meet the surface.
+        MembraneError: no such point is far enough from the rim, or the body does not meet the surface.
     """
     membrane, size = simulator.membrane, simulator.membrane.size
     X, normals, fixed = (a.numpy() for a in (membrane.rest, membrane.rest_normals, membrane.fixed))
@@ -119,16 +119,16 @@ def stroke_to(
     slide: np.ndarray = NO_SLIDE,
     friction: float = 0.0,
 ) -> Stroke:
-    """The stroke of a body that moves towards a point, from where it first touches.
+    """Return the stroke of a body that moves towards a point, from its first contact.
 
     Args:
-        simulator: whose membrane it touches.
-        body: in any pose.
-        aim: `[3]`, the point it moves to.
-        travel: `[3]`, the direction in which it moves.
-        depth: how far from the first touch, length unit.
-        turn: radians about `travel`, from the pose that `facing` gives.
-        slide: `[3]`, how it moves then.
+        simulator: simulator of the sensor whose membrane is pressed.
+        body: the body, in any pose.
+        aim: the target point, `[3]`.
+        travel: direction of the motion, `[3]`.
+        depth: distance travelled from the first contact, length unit.
+        turn: rotation about `travel` from the pose that `facing` returns, rad.
+        slide: displacement after the press, `[3]`.
         friction: Coulomb's coefficient.
 
     Raises:
@@ -142,7 +142,7 @@ def stroke_to(
 
 
 def _random_body(kind: str, size: float, rng: np.random.Generator) -> Indenter:
-    """A body of that kind, of random size."""
+    """Return a body of this kind and of random size."""
     radius = size * np.exp(rng.uniform(*np.log(RADIUS)))
     edge = size * rng.uniform(*EDGE)
     if kind == "sphere":
@@ -169,19 +169,19 @@ def make_frames(
     report: Callable[[str], None] = _report,
     progress: Progress = silent,
 ) -> DatasetOutcome:
-    """Make the frames 0 to `count - 1` of a data set that `frames` does not hold yet.
+    """Make those of the frames 0 to `count - 1` of a data set that `frames` does not contain yet.
 
     A press that fails is reported and left out; the same call tries it again. After an interruption, the frames made so far are
     kept.
 
     Args:
-        simulator: that makes them.
-        plan: what the presses share.
-        count: number of the data set's frames.
-        frames: where they are kept.
-        jobs: processes.
-        report: takes a line for each press that fails; default: it is written to stderr.
-        progress: is told how far it is.
+        simulator: simulator of the sensor.
+        plan: settings that the presses share.
+        count: number of frames in the data set.
+        frames: storage of the frames.
+        jobs: number of processes.
+        report: called with a line for each press that fails; default: writes it to stderr.
+        progress: called with the completed share.
     """
     names = {number: f"s{plan.seed}_{number:06d}" for number in range(count)}
     held = frames.names()
@@ -207,7 +207,7 @@ def make_frames(
 def _in_processes(
     simulator: Simulator, plan: Plan, numbers: Sequence[int], jobs: int, tell: Callable[[int], None] = lambda done: None
 ) -> Iterator[tuple[int, SimulatedFrame | str]]:
-    """Numbers and what comes of them, in their order; `tell` takes how many are done, in whatever order."""
+    """Yield frame numbers and their frames or failures in order; `tell` is called with the number done, in any order."""
     jobs = min(jobs, len(numbers))
     if jobs <= 1:
         for done, number in enumerate(numbers, 1):
@@ -232,7 +232,7 @@ _plan: Plan
 
 
 def _begin(path: Path) -> None:
-    """Start a worker process: what `_work` needs, once."""
+    """Start a worker process by loading what `_work` needs."""
     global _simulator, _plan
     _simulator, _plan = begin_worker(path)
 

@@ -1,4 +1,4 @@
-"""Discs that are drawn into an image, in front of what it shows: the tips of pins."""
+"""Drawing of discs into an image, in front of its contents: the tips of pins."""
 
 import torch
 from torch import Tensor
@@ -7,11 +7,11 @@ from .pattern import inside_unit_disc
 
 
 def draw_discs(image: Tensor, centres: Tensor, radii: Tensor, grey: Tensor) -> None:
-    """Draw discs, one after the other.
+    """Draw discs one after another.
 
     Args:
-        image: image of samples, `[H, W]`; it is changed.
-        centres: `[T, 2]`, samples.
+        image: image of samples, `[H, W]`; it is modified.
+        centres: centres of the discs, `[T, 2]`, samples.
         radii: two across each other as they are imaged, `[T, 2, 2]`: radius, then u and v; what lies between is linear.
         grey: grey value of the discs, `[T]`.
 

@@ -1,6 +1,6 @@
-"""Static equilibrium of the membrane under a pressure that obeys the cavity's law, a dead load, and contacts: Newton's method.
+"""Static equilibrium of the membrane under the cavity's pressure, a dead load and contacts, by Newton's method.
 
-`grad U(x) - h - p grad V(x) = sum of contact forces` on the free vertices, and the cavity's law between V and p.
+`grad U(x) - h - p grad V(x) = sum of contact forces` on the free vertices, with the cavity's law between V and p.
 """
 
 import math
@@ -28,17 +28,17 @@ HALVINGS = 6
 
 
 class Filling(Protocol):
-    """What fills the cavity: the law between its volume and the pressure difference across the membrane."""
+    """The content of the cavity: the law between its volume and the pressure difference across the membrane."""
 
     def gap(self, volume: float, pressure: float) -> tuple[float, float]:
-        """The volume that is missing at this pressure, and the compliance C: `v . dx + C dp = gap` in each Newton step."""
+        """Return the missing volume at this pressure, and the compliance C: `v . dx + C dp = gap` in each Newton step."""
 
 
 class Liquid(NamedTuple):
-    """The volume is kept.
+    """A cavity of constant volume.
 
     Attributes:
-        volume: that is kept, length^3.
+        volume: the volume, length^3.
     """
 
     volume: float
@@ -48,13 +48,13 @@ class Liquid(NamedTuple):
 
 
 class Gas(NamedTuple):
-    """Absolute pressure x volume is kept: `p = p0 + P (V_gas / (V_gas + V - V0) - 1)`.
+    """A gas with constant product of absolute pressure and volume: `p = p0 + P (V_gas / (V_gas + V - V0) - 1)`.
 
     Attributes:
         rest_pressure: p0, pressure difference at rest, force / length^2.
-        rest_volume: V0, between the rest surface and the camera, length^3.
+        rest_volume: V0, volume between the rest surface and the camera, length^3.
         absolute: P, absolute pressure at rest.
-        gas_volume: V_gas, of the gas at rest.
+        gas_volume: V_gas, volume of the gas at rest.
     """
 
     rest_pressure: float
@@ -67,20 +67,20 @@ class Gas(NamedTuple):
 
 
 class Open(NamedTuple):
-    """The pressure stays."""
+    """A cavity of constant pressure."""
 
     def gap(self, volume: float, pressure: float) -> tuple[float, float]:
         return 0.0, math.inf
 
 
 class Solution(NamedTuple):
-    """What `EquilibriumProblem.solve` finds.
+    """The result of `EquilibriumProblem.solve`.
 
     Attributes:
-        vertices: `[V, 3]`.
-        pressure: difference across the membrane, force / length^2.
-        contacts: with their forces.
-        iterations: Newton steps taken.
+        vertices: vertices in equilibrium, `[V, 3]`.
+        pressure: pressure difference across the membrane, force / length^2.
+        contacts: the contacts with their forces.
+        iterations: number of Newton steps.
     """
 
     vertices: Tensor
@@ -92,11 +92,11 @@ class Solution(NamedTuple):
 class EquilibriumProblem:
     """The equilibrium of one membrane, solved by Newton's method.
 
-    Element Hessians are exact; if the resulting step does not descend, their convex part is used. The line search is on the
-    slope of the potential along the step, its volume term augmented; the bordered matrix is never factored.
+    Element Hessians are exact; if the resulting step does not descend, their convex part is used. The line search uses the
+    slope of the potential along the step, with an augmented volume term; the bordered matrix is never factored.
 
     Args:
-        membrane: at rest.
+        membrane: the membrane at rest.
         elasticity: its elastic energy.
         cavity: `Liquid`, `Gas` or `Open`.
         load: dead load on the vertices, `[V, 3]`, force; default: none.
@@ -119,18 +119,18 @@ class EquilibriumProblem:
         self.vertex_stiffness = float(self.matrix(elasticity.hessian_blocks(membrane.rest)).diagonal().mean())
 
     def solve(self, x: Tensor, pressure: float, contacts: Sequence[FrictionalContact] = ()) -> Solution:
-        """The equilibrium near a start.
+        """Find the equilibrium near a start.
 
         Args:
-            x: vertices to start from, `[V, 3]`; the rim stays where it is.
-            pressure: difference across the membrane there.
-            contacts: indenters, at the pose that the equilibrium is sought for.
+            x: initial vertices, `[V, 3]`; the rim is fixed there.
+            pressure: initial pressure difference across the membrane.
+            contacts: contacts with indenters, at the poses for which the equilibrium is sought.
 
         Returns:
-            The equilibrium, converged.
+            The converged equilibrium.
 
         Raises:
-            MembraneError: none is found.
+            MembraneError: no equilibrium is found.
         """
         for iteration in range(NEWTON_STEPS):
             projected = [contact.projected(x[self.free]) for contact in contacts]
@@ -150,7 +150,8 @@ class EquilibriumProblem:
         )
 
     def _imbalance(self, x: Tensor, pressure: float, contact_forces: Sequence[Tensor]) -> np.ndarray:
-        """`grad U - h - p grad V - contact forces` on the free degrees of freedom, `[3 F]`; `contact_forces [F, 3]` each."""
+        """Return `grad U - h - p grad V - contact forces` on the free degrees of freedom, `[3 F]`; `contact_forces [F, 3]`
+        each."""
         field = self.elasticity.gradient(x) - self.load - pressure * self.membrane.volume_gradient(x)
         return (field[self.free] - sum(contact_forces)).numpy().ravel()
 
@@ -160,7 +161,7 @@ class EquilibriumProblem:
     def _step(
         self, x: Tensor, pressure: float, contacts: Sequence[FrictionalContact], positive: bool
     ) -> tuple[Tensor, float, list[FrictionalContact]] | None:
-        """One Newton step: vertices, pressure and contacts, or None if it does not descend."""
+        """Take one Newton step; return vertices, pressure and contacts, or None if it does not descend."""
         active = [contact.active_set(x[self.free]) for contact in contacts]
         each = list(zip(contacts, active, strict=True))
         blocks = self.elasticity.hessian_blocks(x, positive) - pressure * self.membrane.volume_hessian_blocks(x)
@@ -180,7 +181,8 @@ class EquilibriumProblem:
         contacts = [contact.linearised(a, move[self.free]) for contact, a in each]
 
         def slope(x: Tensor) -> float:
-            """Of the potential along the step, with the multipliers it gave: volume and active contacts are augmented."""
+            """Return the slope of the potential along the step, with the step's multipliers; volume and active contacts are
+            augmented."""
             gap, compliance = self._gap(x, pressure)
             held = [contact.held(x[self.free], a) for contact, a in zip(contacts, active, strict=True)]
             return float(direction @ self._imbalance(x, pressure + gap / (compliance + abs(softness)), held))
@@ -194,12 +196,13 @@ class EquilibriumProblem:
 
 
 def _solved(K: csc_matrix, loads: np.ndarray) -> np.ndarray:
-    """`K^-1 loads` by a sparse LU factorisation; raises `RuntimeError` if K is exactly singular."""
+    """Return `K^-1 loads` by a sparse LU factorisation; raises `RuntimeError` if K is exactly singular."""
     return splu(K, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}).solve(loads)
 
 
 class _SparsityPattern:
-    """Sum of triangle blocks and free vertices' blocks on the free degrees of freedom, with a sparsity pattern found once."""
+    """Assembles triangle blocks and free vertices' blocks on the free degrees of freedom; the sparsity pattern is found
+    once."""
 
     def __init__(self, membrane: Membrane) -> None:
         V, free = len(membrane.rest), membrane.free_vertices.numpy()
@@ -224,7 +227,7 @@ class _SparsityPattern:
 
 
 def _pairs(vertices: np.ndarray, free: int) -> np.ndarray:
-    """`column * size + row` of every entry of every block, -1 where a vertex is fixed."""
+    """Return `column * size + row` of every entry of every block, -1 where a vertex is fixed."""
     dofs = (3 * vertices[..., None] + np.arange(3)).reshape(len(vertices), -1)
     fixed = np.repeat(vertices < 0, 3, axis=1)
     pairs = dofs[:, None, :] * (3 * free) + dofs[:, :, None]

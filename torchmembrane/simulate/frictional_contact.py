@@ -1,10 +1,10 @@
-"""Contact of the free vertices with one rigid indenter: unilateral, with Coulomb friction, by a primal-dual active set.
+"""Unilateral contact of the free vertices with a rigid indenter, with Coulomb friction, by a primal-dual active set method.
 
     phi >= 0,  N >= 0,  N phi = 0;        |T| <= mu N,  slip = 0 where |T| < mu N,  T opposite to the slip elsewhere
 
-The nodal forces `N` (along the indenter's normal n) and `T` (tangential) are unknowns beside the positions, found by a
-semismooth Newton method on their projections (Alart, Curnier 1991; Hueber, Stadler, Wohlmuth 2008): `N = max(0, N - c phi)`,
-and T is `T - c_t slip` brought back on the cone. The weights c, c_t > 0 have no influence on the solution.
+The nodal forces `N` (along the indenter's normal n) and `T` (tangential) are unknowns besides the positions. A semismooth
+Newton method finds them from their projections (Alart, Curnier 1991; Hueber, Stadler, Wohlmuth 2008): `N = max(0, N - c phi)`,
+and T is `T - c_t slip` projected onto the friction cone. The weights c, c_t > 0 do not affect the solution.
 """
 
 from typing import NamedTuple
@@ -17,20 +17,20 @@ from .indenters import Indenter, norm
 
 RIGID = 1e3  # the linearised contact's stiffness over c: what still yields in one step is gone in the next
 GENTLE = 0.1  # c_t over c: large enough to show the slip's direction, too small to let what sticks slip at once
-SAME_SIDE = 0.5  # cosine between an indenter's normals at one vertex before and after an increment
+SAME_SIDE = 0.5  # smallest cosine between an indenter's normals at one vertex before and after an increment
 
 
 class ActiveSet(NamedTuple):
-    """The touching vertices of a Newton step and their state, from which the law there is linear in the step.
+    """The vertices in contact in a Newton step and their state, which makes the contact law linear in the step.
 
     Attributes:
-        vertices: `[A]`, which of the free vertices touch.
-        phi: `[A]`, their distance.
-        n: `[A, 3]`, the indenter's normal there.
-        slip: `[A, 3]`, so far.
-        sticks: `[A]` bool.
-        e: `[A, 3]`, direction of T where it slips.
-        turning: `[A]`, stiffness against turning that direction.
+        vertices: indices of the free vertices in contact, `[A]`.
+        phi: their distances from the indenter, `[A]`.
+        n: normals of the indenter there, `[A, 3]`.
+        slip: their slip so far, `[A, 3]`.
+        sticks: `[A]` bool, whether they stick.
+        e: directions of T where they slip, `[A, 3]`.
+        turning: stiffness against rotation of these directions, `[A]`.
     """
 
     vertices: Tensor
@@ -43,15 +43,15 @@ class ActiveSet(NamedTuple):
 
 
 class FrictionalContact(NamedTuple):
-    """One indenter during one increment of its motion, against F free vertices `x [F, 3]`.
+    """One indenter during one increment of its motion, in contact with F free vertices `x [F, 3]`.
 
     Attributes:
-        indenter: at the end of the increment.
-        normal: `[F]`, N, compressive positive.
-        tangential: `[F, 3]`, T.
-        anchor: `[F, 3]`, where the vertices would be had they stuck; slip is counted from there.
-        weight: c, force / length.
-        friction: mu.
+        indenter: the indenter at the end of the increment.
+        normal: normal forces N, `[F]`, positive in compression.
+        tangential: tangential forces T, `[F, 3]`.
+        anchor: positions of the vertices if they had stuck, `[F, 3]`, from which slip is measured.
+        weight: weight c, force / length.
+        friction: Coulomb's coefficient mu.
 
     Reference:
         P. Alart, A. Curnier: A mixed formulation for frictional contact problems prone to Newton like solution methods, 1991.
@@ -68,16 +68,16 @@ class FrictionalContact(NamedTuple):
 
     @classmethod
     def at_first_pose(cls, indenter: Indenter, x: Tensor, weight: float, friction: float) -> "FrictionalContact":
-        """No force yet, the indenter at its first pose."""
+        """Return the contact without force, with the indenter at its first pose."""
         return cls(indenter, torch.zeros_like(x[:, 0]), torch.zeros_like(x), x, weight, friction)
 
     def carried_to(self, pose: Indenter, x: Tensor) -> "FrictionalContact":
-        """The next increment: the indenter moves to `pose`, from an equilibrium `x` in which this contact held.
+        """Return the contact of the next increment: the indenter moves to `pose` from an equilibrium `x` with this contact.
 
-        A vertex that it meets on the way is carried along only from the point of contact on.
+        A vertex that the indenter meets on the way is carried along only from the point of contact on.
 
         Raises:
-            MembraneError: the indenter may overtake a vertex, which then would end up inside it, or on another side.
+            MembraneError: the indenter may overtake a vertex, which would then be inside it or on another side of it.
         """
         (before, n_before), (after, n_after) = (self._distance_and_normal(body, x) for body in (self.indenter, pose))
         turn = pose.rotation @ self.indenter.rotation.T
@@ -91,7 +91,7 @@ class FrictionalContact(NamedTuple):
         return self._replace(indenter=pose, tangential=self.tangential @ turn.T, anchor=x + share * travel)
 
     def projected(self, x: Tensor) -> "FrictionalContact":
-        """The contact with the projections of N and T at `x`; in equilibrium they are N and T."""
+        """Return the contact with the projections of N and T at `x`; in equilibrium they equal N and T."""
         index, phi, n = self._touching(x)
         normal = self.normal[index] - self.weight * phi
         trial = self._trial(x, index, n)
@@ -99,18 +99,18 @@ class FrictionalContact(NamedTuple):
         return self._with(index, normal, cone.clamp_max(1)[:, None] * trial)
 
     def force(self, x: Tensor) -> Tensor:
-        """`N n + T` on the vertices at `x`, `[F, 3]`."""
+        """Return the forces `N n + T` on the vertices at `x`, `[F, 3]`."""
         index = torch.nonzero(self.normal).squeeze(-1)
         n = self.indenter.normal(x[index]).detach()
         return torch.zeros_like(x).index_copy(0, index, self.normal[index, None] * n + self.tangential[index])
 
     def distance_from(self, other: "FrictionalContact") -> float:
-        """Largest difference between the nodal force components of two contacts."""
+        """Return the largest difference between the nodal force components of two contacts."""
         normal, tangential = self.normal - other.normal, self.tangential - other.tangential
         return float(torch.cat([normal, tangential.ravel()]).abs().max())
 
     def active_set(self, x: Tensor) -> ActiveSet:
-        """Which vertices touch at `x`, and which of them stick."""
+        """Return the vertices in contact at `x` and their state."""
         index, phi, n = self._touching(x)
         trial = self._trial(x, index, n)
         size, bound = norm(trial), self.friction * self.normal[index].clamp_min(0)
@@ -120,7 +120,7 @@ class FrictionalContact(NamedTuple):
         return ActiveSet(index, phi, n, (x - self.anchor)[index], size <= bound, e, turning)
 
     def linearised(self, active: ActiveSet, move: Tensor | float = 0.0) -> "FrictionalContact":
-        """The contact with the forces that the law, linearised, gives the active vertices after a `move [F, 3]`."""
+        """Return the contact with the forces of the linearised law on the active vertices after a `move [F, 3]`."""
         rigid, index, n, e = RIGID * self.weight, active.vertices, active.n, active.e
         move = torch.broadcast_to(torch.as_tensor(move, dtype=n.dtype), self.tangential.shape)[index]
         normal = self.normal[index] - rigid * (active.phi + (n * move).sum(-1))
@@ -132,7 +132,8 @@ class FrictionalContact(NamedTuple):
         return self._with(index, normal, torch.where(active.sticks[:, None], sticking, slipping))
 
     def stiffness_blocks(self, x: Tensor, active: ActiveSet) -> Tensor:
-        """Minus the derivative of each vertex's linearised force in its own move, `[F, 3, 3]`; not symmetric with friction."""
+        """Return minus the derivative of each vertex's linearised force in its own move, `[F, 3, 3]`; asymmetric with
+        friction."""
         rigid, index, n, e = RIGID * self.weight, active.vertices, active.n, active.e
         blocks = rigid * _outer(n, n) - self.normal[index, None, None] * self._curvature(x[index])
         if self.friction:
@@ -142,7 +143,8 @@ class FrictionalContact(NamedTuple):
         return torch.zeros(len(x), 3, 3, dtype=x.dtype).index_copy(0, index, blocks)
 
     def held(self, x: Tensor, active: ActiveSet) -> Tensor:
-        """Forces `[F, 3]` at `x` if no other vertex touches: N and T, less c times what penetrates, or slips though stuck."""
+        """Return forces `[F, 3]` at `x` if no other vertex is in contact: N and T, less c times the penetration and the slip of
+        sticking vertices."""
         phi, n = self._distance_and_normal(self.indenter, x[active.vertices])
         force = (self.normal[active.vertices] - self.weight * phi)[:, None] * n + self.tangential[active.vertices]
         if self.friction:
@@ -170,7 +172,7 @@ class FrictionalContact(NamedTuple):
         )
 
     def _curvature(self, points: Tensor) -> Tensor:
-        """Second derivatives of the distance, `[A, 3, 3]`; zero where the indenter has none."""
+        """Return the second derivatives of the distance, `[A, 3, 3]`; zero if the indenter has none."""
         points = points.detach().requires_grad_()
         _, n = self.indenter.distance_and_normal(points)
         if not n.requires_grad:
@@ -180,10 +182,10 @@ class FrictionalContact(NamedTuple):
 
 
 def _outer(p: Tensor, q: Tensor) -> Tensor:
-    """`p q^T` of `[A, 3]` and `[A, 3]`, `[A, 3, 3]`."""
+    """Return `p q^T` of `[A, 3]` and `[A, 3]`, `[A, 3, 3]`."""
     return p[:, :, None] * q[:, None, :]
 
 
 def _tangential(vectors: Tensor, n: Tensor) -> Tensor:
-    """The part of `vectors [A, 3]` across unit `n [A, 3]`."""
+    """Return the part of `vectors [A, 3]` orthogonal to unit vectors `n [A, 3]`."""
     return vectors - (vectors * n).sum(-1, keepdim=True) * n
