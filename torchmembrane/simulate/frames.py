@@ -1,4 +1,4 @@
-"""Simulated frames on disk: the sensor they belong to, and each frame as PNG and npz or as a row of a Parquet data set."""
+"""Storage of simulated frames: their sensor, and each frame as PNG and npz or as a row of a Parquet data set."""
 
 import io
 import json
@@ -32,23 +32,23 @@ FORMATS = ("png", "parquet")
 
 
 class SimulatedFrames:
-    """Frames as NAME.png and NAME_truth.npz in a folder; of views with images of their own as NAME_VIEW.png each.
+    """Frames stored as NAME.png and NAME_truth.npz in a folder; if views have separate images, as one NAME_VIEW.png each.
 
     Args:
-        folder: that exists.
-        views: names of the views that have images of their own, if there are several.
+        folder: an existing folder.
+        views: names of the views that have separate images, if there are several.
     """
 
     def __init__(self, folder: Path, views: Sequence[str] = ()) -> None:
         self.folder, self.views = folder, views
 
     def names(self) -> set[str]:
-        """The frames that are there."""
+        """Return the names of the stored frames."""
         found = {path.name.removesuffix("_truth.npz") for path in self.folder.glob("*_truth.npz") if not is_of_system(path)}
         return {name for name in found if all(path.exists() for path in self.images(name))}
 
     def images(self, name: str) -> list[Path]:
-        """The image files of a frame."""
+        """Return the image files of a frame."""
         return [self.folder / file for file in image_files(name, self.views)]
 
     def write(self, name: str, frame: SimulatedFrame) -> None:
@@ -58,14 +58,14 @@ class SimulatedFrames:
         self.write_truth(name, frame)
 
     def write_truth(self, name: str, frame: SimulatedFrame) -> None:
-        """Write a frame's truth alone."""
+        """Write only a frame's truth."""
         save_frame(self.folder / f"{name}_truth.npz", frame.truth)
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: frames are not buffered."""
 
     def __iter__(self) -> Iterator[tuple[str, SimulatedFrame]]:
-        """Names and frames in name order."""
+        """Yield names and frames in name order."""
         for name in sorted(self.names(), key=in_order):
             truth = read_arrays(self.folder / f"{name}_truth.npz", None, A_TRUTH, NUMBERS + TEXT)
             first, *further = map(read_pixels, self.images(name))
@@ -73,14 +73,15 @@ class SimulatedFrames:
 
 
 class SimulatedFrameTable(SimulatedFrames):
-    """Frames as rows of `frames/part-*.parquet`: `name`, `image` (a PNG file's bytes), and the truth, arrays as flat lists.
+    """Frames stored as rows of `frames/part-*.parquet`: `name`, `image` (content of a PNG file) and the truth as flat lists.
 
-    The schema's metadata hold the arrays' shapes (`shapes`) and the sensor's `[record]` (`record`), both JSON. What is the same
-    in all frames stands in `rest_truth.npz`. Rows are held back until `PART_ROWS` of them make a file; `flush` writes the rest.
+    The schema's metadata contain the arrays' shapes (`shapes`) and the sensor's `[record]` (`record`), both as JSON. Arrays
+    that are the same in all frames are in `rest_truth.npz`. Rows are buffered until `PART_ROWS` of them fill a file; `flush`
+    writes the rest.
 
     Args:
-        folder: that exists.
-        record: record of the sensor, as `Record.text`.
+        folder: an existing folder.
+        record: record of the sensor, as in `Record.text`.
     """
 
     def __init__(self, folder: Path, record: str = "") -> None:
@@ -142,14 +143,14 @@ def _truth(row: dict[str, Any], shapes: dict[str, list[int]]) -> dict[str, np.nd
 
 @contextmanager
 def video_file(path: Path, rate: int = 25) -> Iterator[Callable[[np.ndarray], None]]:
-    """An H.264 video that is written image by image, whole or not at all.
+    """Write an H.264 video image by image; the file appears only when it is complete.
 
     Args:
         path: path of the file, `.mp4`.
-        rate: images a second.
+        rate: images per second.
 
     Yields:
-        What takes the next image, `[H, W]` uint8, all of one size; one at least.
+        A function that takes the next image, `[H, W]` uint8, all of one size; it must be called at least once.
     """
     av = load_pyav()
     stream: Any = None
@@ -168,12 +169,12 @@ def video_file(path: Path, rate: int = 25) -> Iterator[Callable[[np.ndarray], No
 
 
 def open_frames(folder: Path, simulator: Simulator, settings: dict[str, Any], format: str = "png") -> SimulatedFrames:
-    """The frames of a folder that is made if need be, with the sensor as simulated: its rest image from the same light.
+    """Open the frames of a folder, which is created if necessary, with the simulated sensor and its rest image.
 
     Args:
-        folder: new, or of the same simulation.
-        simulator: that makes the frames.
-        settings: what else all frames have in common; kept in the folder.
+        folder: a new folder, or one of the same simulation.
+        simulator: simulator of the frames.
+        settings: other settings that all frames share; they are stored in the folder.
         format: "png" or "parquet".
 
     Raises:
@@ -194,7 +195,7 @@ def open_frames(folder: Path, simulator: Simulator, settings: dict[str, Any], fo
 
 
 def image_files(name: str, views: Sequence[str]) -> list[str]:
-    """Names of a frame's image files.
+    """Return the names of a frame's image files.
 
     Example:
         >>> image_files("press", ()), image_files("press", ("left", "right"))
@@ -204,7 +205,7 @@ def image_files(name: str, views: Sequence[str]) -> list[str]:
 
 
 def png(image: np.ndarray) -> bytes:
-    """An image `[H, W]` uint8 as a PNG file's content.
+    """Encode an image `[H, W]` uint8 as the content of a PNG file.
 
     Example:
         >>> png(np.zeros((2, 3), np.uint8))[1:4]
@@ -216,7 +217,7 @@ def png(image: np.ndarray) -> bytes:
 
 
 def _check(folder: Path, settings: dict[str, Any]) -> None:
-    """Refuse a folder that is not of these settings."""
+    """Refuse a folder that was made with other settings."""
     if folder.exists() and not folder.is_dir():
         raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier simulations of this sensor")
     if not (folder / SETTINGS).exists():

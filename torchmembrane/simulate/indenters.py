@@ -1,7 +1,7 @@
-"""Rigid indenters as signed distance functions: negative inside, gradient = outward normal.
+"""Rigid indenters as signed distance functions: negative inside; the gradient is the outward normal.
 
-Every indenter is given in its own frame, in which it presses along +z with its tip at the origin or its centre there, and is
-placed by a rotation and a translation: `x = R y + t`. Distances are exact outside; inside, exact up to the medial axis.
+Every indenter is defined in its own frame, in which it presses along +z with its tip or centre at the origin. It is placed by a
+rotation and a translation: `x = R y + t`. Distances are exact outside, and inside up to the medial axis.
 """
 
 from collections.abc import Sequence
@@ -23,13 +23,14 @@ Vector = Tensor | np.ndarray | Sequence[float]
 
 @check_arguments
 def facing(direction: Vector) -> Tensor:
-    """A rotation that turns a body's +z to a direction.
+    """Return a rotation that turns a body's +z axis to a direction.
 
     Args:
-        direction: `[3]`, of any length.
+        direction: the direction, `[3]`, of any length.
 
     Returns:
-        The rotation `[3, 3]`: its third column is the direction, its first as near to x as can be (to y for x itself).
+        The rotation `[3, 3]`: its third column is the direction, its first is as close to x as possible (to y if the direction
+        is x).
 
     Example:
         >>> facing((0, 0, -2.0))[:, 2].tolist()
@@ -44,11 +45,11 @@ def facing(direction: Vector) -> Tensor:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Indenter:
-    """A rigid body; subclasses give `local_distance(points [..., 3]) -> [...]` in the body's own frame.
+    """A rigid body; subclasses define `local_distance(points [..., 3]) -> [...]` in the body's own frame.
 
     Args:
-        translation: `[3]`, length unit, in the camera's frame.
-        rotation: `[3, 3]`, to the camera's frame.
+        translation: position in the camera's frame, `[3]`, length unit.
+        rotation: rotation to the camera's frame, `[3, 3]`.
 
     Raises:
         MembraneError: `rotation` is not a rotation, or a size is not positive.
@@ -77,23 +78,23 @@ class Indenter:
 
     @property
     def kind(self) -> str:
-        """The body's name in a frame's truth: sphere, plane, mesh ..."""
+        """Return the body's name in a frame's truth: sphere, plane, mesh ..."""
         return type(self).__name__.removesuffix("Indenter").lower()
 
     def local_distance(self, points: Tensor) -> Tensor:
-        """Signed distance of points given in the body's own frame, `[..., 3]` to `[...]`."""
+        """Return the signed distance of points in the body's own frame, `[..., 3]` to `[...]`."""
         raise NotImplementedError
 
     def distance(self, points: Tensor) -> Tensor:
-        """Signed distance of `points [..., 3]` to the surface, `[...]`, negative inside."""
+        """Return the signed distance of `points [..., 3]` from the surface, `[...]`, negative inside."""
         return self.local_distance((points - self.translation) @ self.rotation)
 
     def normal(self, points: Tensor) -> Tensor:
-        """Outward unit normal `[..., 3]`, the gradient of `distance`; differentiable where that is smooth."""
+        """Return the outward unit normal `[..., 3]`, the gradient of `distance`; differentiable where that is smooth."""
         return self.distance_and_normal(points)[1]
 
     def distance_and_normal(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """`distance` and `normal` at once."""
+        """Return `distance` and `normal` together."""
         with torch.enable_grad():
             points = points if points.requires_grad else points.detach().requires_grad_()
             distance = self.distance(points)
@@ -102,34 +103,34 @@ class Indenter:
 
     @check_arguments
     def at(self, translation: Vector, rotation: Tensor | None = None) -> "Indenter":
-        """The same body at another place, `translation [3]`, turned by `rotation [3, 3]` (default: as before)."""
+        """Return the same body at `translation [3]`, turned by `rotation [3, 3]` (default: unchanged)."""
         place = _vector(f"{type(self).__name__}.at: translation", translation)
         return replace(self, translation=place, rotation=self.rotation if rotation is None else rotation)
 
     @check_arguments
     def moved(self, offset: Vector) -> "Indenter":
-        """The same body, translated by `offset [3]`."""
+        """Return the same body, translated by `offset [3]`."""
         return self.at(self.translation + _vector(f"{type(self).__name__}.moved: offset", offset))
 
     @check_arguments
     def between(self, other: "Indenter", share: float) -> "Indenter":
-        """The pose after `share` of the way to `other`: straight, and turning evenly about one axis."""
+        """Return the body at a `share` of the way to `other`: along a straight line, with uniform rotation about one axis."""
         turns = Rotation.from_matrix(np.stack([self.rotation.detach(), other.rotation.detach()]))
         rotation = torch.from_numpy(Slerp([0, 1], turns)(share).as_matrix().copy())
         return self.at(torch.lerp(self.translation, other.translation, share), rotation)
 
     @check_arguments
     def touching(self, membrane: Membrane, direction: Vector) -> "Indenter":
-        """The body moved from far outside until it just touches the rest surface's vertices.
+        """Return the body moved from far outside until it just touches the vertices of the rest surface.
 
-        Conservative advancement: a step by the smallest distance never goes too far.
+        The method is conservative advancement: a step by the smallest distance never goes too far.
 
         Args:
-            membrane: at rest.
-            direction: `[3]`, along which it moves.
+            membrane: the membrane at rest.
+            direction: direction of the motion, `[3]`.
 
         Raises:
-            MembraneError: it passes by, or faces away.
+            MembraneError: the body misses the surface, or faces away from it.
         """
         direction = _vector(f"{type(self).__name__}.touching: direction", direction)
         d = torch.nn.functional.normalize(direction, dim=-1)
@@ -156,7 +157,7 @@ class Indenter:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Sphere(Indenter):
-    """A ball around the origin.
+    """A ball centred at the origin.
 
     Args:
         radius: length unit.
@@ -196,9 +197,9 @@ class Cylinder(Indenter):
     """A cylinder about an axis through the origin.
 
     Args:
-        radius: length unit.
-        axis: its direction, `[3]`; default: x.
-        length: between its flat ends; default: endless.
+        radius: radius, length unit.
+        axis: direction of the axis, `[3]`; default: x.
+        length: distance between the flat ends, length unit; default: infinite.
 
     Example:
         >>> Cylinder(2.0, length=6.0).distance(torch.tensor([[0.0, 0, 4], [6.0, 0, 0]])).tolist()
@@ -228,11 +229,11 @@ class Cylinder(Indenter):
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Wedge(Indenter):
-    """A straight edge along x, its tip at the origin pointing to +z.
+    """A straight edge along x, with its tip at the origin pointing to +z.
 
     Args:
-        opening: between its flanks, degrees.
-        radius: radius of its rounded edge, length unit.
+        opening: angle between the flanks, degrees.
+        radius: radius of the rounded edge, length unit.
 
     Example:
         >>> round(Wedge(90.0, 0.5).distance(torch.tensor([0.0, 0, 2])).item(), 6)
@@ -258,11 +259,11 @@ class Wedge(Indenter):
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Box(Indenter):
-    """A box around the origin, its edges and corners rounded.
+    """A box centred at the origin, with rounded edges and corners.
 
     Args:
-        sides: `[3]`, length unit.
-        radius: radius of edges and corners.
+        sides: lengths of the sides, `[3]`, length unit.
+        radius: radius of edges and corners, length unit.
 
     Example:
         >>> Box((4.0, 4.0, 2.0), 0.5).distance(torch.tensor([[0.0, 0, 3], [0.0, 0, 0]])).tolist()
@@ -289,7 +290,7 @@ class Union(Indenter):
     """Several bodies joined to one rigid body.
 
     Args:
-        parts: the bodies, each in its pose within the whole.
+        parts: the bodies, each in its pose relative to the union.
 
     Example:
         >>> pair = Union([Sphere(1.0, translation=(-2, 0, 0)), Sphere(1.0, translation=(2, 0, 0))])
@@ -316,11 +317,11 @@ def _vector(name: str, values: Vector) -> Tensor:
 
 
 def norm(vectors: Tensor) -> Tensor:
-    """Length `[...]`; zero, with zero gradient, for the zero vector."""
+    """Return the length of vectors, `[...]`; zero, with zero gradient, for the zero vector."""
     square = (vectors * vectors).sum(-1)
     return torch.where(square > 0, square, 1).sqrt() * (square > 0)
 
 
 def box_distance(excess: Tensor) -> Tensor:
-    """Signed distance to a box by how far a point exceeds each side, `[..., C]` to `[...]`."""
+    """Return the signed distance to a box from the distances by which a point exceeds each side, `[..., C]` to `[...]`."""
     return norm(excess.clamp_min(0)) + excess.amax(-1).clamp_max(0)

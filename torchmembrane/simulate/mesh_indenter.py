@@ -1,4 +1,4 @@
-"""A rigid indenter given as a closed triangle mesh; through trimesh (extra `mesh`)."""
+"""A rigid indenter given as a closed triangle mesh; it requires trimesh (extra `mesh`)."""
 
 import io
 from dataclasses import dataclass, field
@@ -16,16 +16,16 @@ from .indenters import Indenter, box_distance
 
 KINDS = ("stl", "obj", "ply")
 MOST_TRIANGLES, MOST_BYTES = 200_000, 2**25
-"""Largest number of triangles and of bytes of a file."""
+"""Largest number of triangles, and of bytes, of a file."""
 
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class MeshIndenter(Indenter):
-    """A body with the surface of a closed triangle mesh.
+    """A body bounded by a closed triangle mesh.
 
-    Distances are exact within the mesh's bounding box, enlarged by a quarter of its longest side; farther away they are the
-    distance to that box's content, a lower bound. The normal turns at edges without being differentiable there.
+    Distances are exact within the mesh's bounding box, enlarged by a quarter of its longest side. Farther away they are the
+    distance to the contents of that box, a lower bound. The normal is not differentiable at edges.
 
     Args:
         vertices: `[N, 3]`, length unit.
@@ -70,14 +70,15 @@ class MeshIndenter(Indenter):
 
     @classmethod
     def read(cls, path: str | Path, **pose: Any) -> "MeshIndenter":
-        """The closed mesh in a file.
+        """Read a closed mesh from a file.
 
         Args:
             path: an STL, OBJ or PLY file, in the sensor's length unit.
-            pose: `translation`, `rotation`.
+            pose: `translation` and `rotation` of the body.
 
         Raises:
-            MembraneError: the file is no such mesh, too large or damaged, the mesh is not closed, or trimesh is not installed.
+            MembraneError: the file is not such a mesh, too large or damaged, the mesh is not closed, or trimesh is not
+                installed.
         """
         path, expected = Path(path), f"a closed mesh as STL, OBJ or PLY, of at most {MOST_TRIANGLES} triangles"
         kind, trimesh = path.suffix.lower().removeprefix("."), _trimesh()
@@ -104,7 +105,7 @@ class MeshIndenter(Indenter):
         return box.masked_scatter(near, exact)
 
     def _closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Closest surface points and the distance's gradient, its sign by the feature's normal; `[P, 3]` each."""
+        """Return the closest surface points and the distance's gradient, signed by the feature's normal; `[P, 3]` each."""
         if not len(points):
             return points, points
         closest, distance, triangle = self._body.nearest.on_surface(points)
@@ -119,7 +120,7 @@ class MeshIndenter(Indenter):
 
 
 def _feature_normals(body: Any) -> np.ndarray:
-    """Unit normals `[M, 7, 3]` of each triangle, the edges opposite its corners, and its corners (weighted by angle)."""
+    """Return unit normals `[M, 7, 3]` of each triangle, its edges opposite the corners, and its corners (weighted by angle)."""
     faces = body.face_normals
     edges = np.zeros((len(body.edges_unique), 3))
     np.add.at(edges, body.faces_unique_edges, faces[:, None])
@@ -130,10 +131,10 @@ def _feature_normals(body: Any) -> np.ndarray:
 
 
 def _whole_stl(content: bytes) -> bytes:
-    """An STL, binary as it is, text in UTF-8.
+    """Check the content of an STL file and return it, text as UTF-8.
 
     Raises:
-        ValueError: it is neither: trimesh would take a binary one of another length for text.
+        ValueError: the content is neither binary nor text STL; trimesh would read a binary file of the wrong length as text.
     """
     triangles = int.from_bytes(content[80:84], "little")
     if len(content) == 84 + 50 * triangles:
@@ -147,7 +148,7 @@ def _whole_stl(content: bytes) -> bytes:
 
 
 def _in_utf8(content: bytes) -> bytes:
-    """Text in UTF-8; names and comments alone can have been in another encoding."""
+    """Return text in UTF-8; only names and comments can have had another encoding."""
     try:
         content.decode()
     except UnicodeDecodeError:

@@ -1,4 +1,4 @@
-"""Patterns painted on the membrane, which move with it: dots, speckle, or the pattern in a rest image."""
+"""Patterns on the membrane, which move with it: dots, speckle, or the pattern of a rest image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ..errors import MembraneError, check_arguments, expect
 from ..sensor.sensor import Sensor
 
 DOT_RADIUS = {"small": 0.16, "large": 0.27}  # over the dots' spacing
-WAVES = 96  # of a speckle
+WAVES = 96  # number of plane waves of a speckle
 
 
 class Canvas(NamedTuple):
@@ -22,8 +22,8 @@ class Canvas(NamedTuple):
 
     Attributes:
         vertices: `[V, 3]`.
-        pixels: where they are in the image, `[V, 2]`.
-        white: grey of a white membrane there, `[V]`.
+        pixels: pixels of the vertices, `[V, 2]`.
+        white: grey value of a white membrane there, `[V]`.
     """
 
     vertices: Tensor
@@ -34,21 +34,22 @@ class Canvas(NamedTuple):
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Dots:
-    """Discs of `ink` on a ground, both as reflectances in 0..1.
+    """Discs of reflectance `ink` on a ground of reflectance `ground`, both in 0..1.
 
-    A disc is all material whose rest distance from `positions[d]`, in the tangent plane there, is at most `radii[d]`; at a
-    height it is the tip of a pin, across the inward normal at `positions[d]`, and the pin itself is not drawn.
+    A disc consists of all material points whose rest distance from `positions[d]`, in the tangent plane there, is at most
+    `radii[d]`. A disc with a height is the tip of a pin, perpendicular to the normal at `positions[d]`; the pin itself is not
+    drawn.
 
     Args:
         positions: centres at rest, `[D, 3]`, length unit.
-        radii: `[D]`, length unit.
-        missing: dots that are not painted.
+        radii: radii of the discs, `[D]`, length unit.
+        missing: indices of dots that are not painted.
         ink: reflectance of the discs.
         ground: reflectance around them.
-        heights: `[D]`, above the surface along its inward normal, length unit; None: all lie on it.
+        heights: heights above the surface along its inward normal, `[D]`, length unit; None: all dots lie on it.
 
     Raises:
-        MembraneError: radii, reflectances or missing dots that make no sense.
+        MembraneError: radii, reflectances or missing dots are invalid.
 
     Example:
         >>> Dots(np.zeros((2, 3)), np.array([0.3, 0.5]), missing=[1]).described()
@@ -83,7 +84,7 @@ class Dots:
     @classmethod
     @check_arguments
     def from_sensor(cls, sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> "Dots":
-        """The dots that a sensor lists; `radii` of small and large ones, default 0.16 and 0.27 of their spacing."""
+        """Return the dots of a sensor; `radii` are those of small and large dots, default 0.16 and 0.27 of their spacing."""
         positions, sizes = sensor.markers.positions, sensor.markers.sizes
         if positions is None or sizes is None:
             raise MembraneError(f"sensor {sensor.name!r} lists no dots; expected markers.file with their rest positions")
@@ -102,12 +103,12 @@ class Dots:
     of = from_sensor  # its name before 0.2.0
 
     def described(self) -> dict[str, Any]:
-        """What a data set's settings keep of the pattern."""
+        """Return the description of the pattern that a data set's settings store."""
         told = {"dot_radii": sorted(set(self.radii.tolist())), "missing": list(self.missing), "ink": self.ink}
         return told | ({"heights": self.heights.tolist()} if np.any(self.heights) else {})  # type: ignore[union-attr]
 
     def albedo(self, canvas: Canvas) -> Tensor:
-        """Reflectance `[V]` of the ground; discs are drawn sample by sample."""
+        """Return the reflectance `[V]` of the ground; discs are drawn sample by sample."""
         return torch.full_like(canvas.white, self.ground)
 
 
@@ -126,9 +127,10 @@ def _refuse_overlap(dots: Dots) -> None:
 @check_arguments
 @dataclass(frozen=True)
 class Speckle:
-    """Random grains, the same for the same `seed`.
+    """Random grains, reproducible by `seed`.
 
-    The sum of plane waves `cos(k . X + phase)` over rest positions X, 1.4 to 4 grains long, made steeper by tanh.
+    The reflectance is a sum of plane waves `cos(k . X + phase)` over rest positions X, of wavelengths 1.4 to 4 grains,
+    sharpened by tanh.
 
     Args:
         size: mean size of a grain, length unit.
@@ -136,7 +138,7 @@ class Speckle:
         dark: reflectance of the darkest grains.
 
     Raises:
-        MembraneError: a size that is not positive.
+        MembraneError: the size is not positive.
 
     Example:
         >>> canvas = Canvas(torch.rand(100, 3), torch.zeros(100, 2), torch.ones(100))
@@ -154,7 +156,7 @@ class Speckle:
             raise MembraneError(f"Speckle: size = {self.size}; expected a positive length")
 
     def albedo(self, canvas: Canvas) -> Tensor:
-        """Reflectance `[V]`."""
+        """Return the reflectance `[V]`."""
         rng = np.random.default_rng(self.seed)
         direction = rng.normal(size=(WAVES, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -168,7 +170,7 @@ class Speckle:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """The pattern in a rest image, projected onto the rest surface and corrected for the illumination.
+    """The pattern of a rest image, projected onto the rest surface and corrected for the illumination.
 
     Args:
         image: the rest image, `[height, width]`, grey 0..1.
@@ -183,11 +185,11 @@ class Painted:
     cell = 1.0
 
     def described(self) -> dict[str, Any]:
-        """What a data set's settings keep of the pattern."""
+        """Return the description of the pattern that a data set's settings store."""
         return {}
 
     def albedo(self, canvas: Canvas) -> Tensor:
-        """Reflectance `[V]`."""
+        """Return the reflectance `[V]`."""
         height, width = self.image.shape
         image = torch.from_numpy(self.image).to(canvas.white)
         place = (2 * canvas.pixels.nan_to_num(-1e3) + 1) / canvas.pixels.new_tensor([width, height]) - 1
@@ -196,15 +198,15 @@ class Painted:
 
 
 def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> Dots | Painted:
-    """The pattern of a sensor: the dots that it lists, or else the pattern in its rest image.
+    """Return the pattern of a sensor: its listed dots, or else the pattern in its rest image.
 
     Args:
         sensor: the sensor.
         radii: radii of small and large dots, length unit; default: 0.16 and 0.27 of their spacing.
-        missing: dots that are not painted.
+        missing: indices of dots that are not painted.
 
     Raises:
-        MembraneError: radii or missing dots are given and the sensor lists none.
+        MembraneError: radii or missing dots are given, but the sensor lists no dots.
 
     Example:
         >>> from torchmembrane.presets import preset
@@ -221,14 +223,14 @@ def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Se
 
 
 def inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
-    """The share of each sample that lies within the unit disc, whose outline is taken as straight.
+    """Return the share of each sample that lies within the unit disc, whose outline is approximated as straight.
 
     Args:
-        place: place of the samples, in units of the disc's radius, `[S, 2]`.
-        slope: its derivative in the image, `[S, 2, 2]`.
+        place: positions of the samples in units of the disc's radius, `[S, 2]`.
+        slope: derivatives of the positions in the image, `[S, 2, 2]`.
 
     Returns:
-        Shares, `[S]`.
+        Shares in 0..1, `[S]`.
 
     Example:
         >>> inside_unit_disc(torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), 0.1 * torch.eye(2).expand(3, 2, 2)).tolist()
@@ -243,16 +245,16 @@ def inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
 def dot_coordinates(
     corners: np.ndarray, positions: np.ndarray, normals: np.ndarray, radii: np.ndarray
 ) -> tuple[Tensor, Tensor]:
-    """Triangles that a dot may touch, and their corners in its tangent plane.
+    """Return the triangles that a dot may touch, and their corners in its tangent plane.
 
     Args:
         corners: corners of the triangles, `[T, 3, 3]`.
         positions: positions of the dots, `[D, 3]`.
-        normals: there, `[D, 3]`.
-        radii: `[D]`.
+        normals: normals at the dots, `[D, 3]`.
+        radii: radii of the dots, `[D]`.
 
     Returns:
-        Which triangles, `[T]` bool, and their corners in units of the dot's radius, `[I, 3, 2]`.
+        Whether each triangle is touched, `[T]` bool, and the corners of those in units of the dot's radius, `[I, 3, 2]`.
     """
     middle = corners.mean(1)
     reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(1)

@@ -1,4 +1,4 @@
-"""A membrane pressed by rigid indenters along given paths: static equilibrium at every pose."""
+"""A membrane pressed by rigid indenters along given paths: static equilibrium at each pose."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -16,26 +16,26 @@ from .equilibrium import EquilibriumProblem, Filling, Gas, Liquid, Open
 from .frictional_contact import FrictionalContact
 from .indenters import Indenter
 
-FINEST = 1 / 64  # of an increment, before a press is given up
+FINEST = 1 / 64  # smallest share of an increment before a press is given up
 
 
 class Press(NamedTuple):
-    """A membrane in equilibrium with its indenters, converged; float64, the camera's frame, lengths in the membrane's unit.
+    """A converged equilibrium of a membrane with its indenters; float64, camera frame, lengths in the membrane's unit.
 
     Attributes:
-        vertices: `[V, 3]`, deformed.
-        contact: `[V]` bool, which vertices touch.
-        traction: `[V, 3]`, contact force per deformed area on the membrane.
-        force: `[3]`, total contact force on the membrane.
-        forces: `[I, 3]`, of each indenter.
-        contact_points: `[I, 3]`, centroid of each indenter's normal forces, NaN where it does not touch.
+        vertices: deformed vertices, `[V, 3]`.
+        contact: `[V]` bool, whether each vertex is in contact.
+        traction: contact force on the membrane per deformed area, `[V, 3]`.
+        force: total contact force on the membrane, `[3]`.
+        forces: contact force of each indenter, `[I, 3]`.
+        contact_points: centroid of each indenter's normal forces, `[I, 3]`, NaN without contact.
         pressure: pressure difference across the membrane.
-        rest_pressure: the same without contact.
+        rest_pressure: pressure difference without contact.
         volume_error: `(V - V_rest) / V_rest`.
         penetration: largest depth of a free vertex inside an indenter.
-        rim_reaction: `[3]`, force of the rim on the membrane.
+        rim_reaction: force of the rim on the membrane, `[3]`.
         imbalance: sum of all forces over the sum of the magnitudes of the contact and pressure forces.
-        iterations: Newton steps since the previous pose.
+        iterations: number of Newton steps since the previous pose.
     """
 
     vertices: Tensor
@@ -55,13 +55,13 @@ class Press(NamedTuple):
 
 @check_arguments
 def press(membrane: Membrane, elasticity: ElasticEnergy, paths: Sequence[Sequence[Indenter]], **options: Any) -> Press:
-    """The last state of `presses`, which takes the same arguments.
+    """Return the last state of `presses`, which takes the same arguments.
 
     Args:
-        membrane: at rest.
+        membrane: the membrane at rest.
         elasticity: its elastic energy.
-        paths: for each indenter its poses.
-        options: as of `presses`.
+        paths: the poses of each indenter.
+        options: further arguments of `presses`.
 
     Returns:
         The equilibrium at the last poses.
@@ -92,30 +92,32 @@ def presses(
     friction: float = 0.0,
     increment: float | None = None,
 ) -> Iterator[Press]:
-    """Static equilibrium at every pose of the paths, one after the other.
+    """Compute the static equilibrium at each pose of the paths, one after another.
 
-    The rest load is taken up as a dead load, so that without contact the rest surface stays.
+    The rest load is applied as a dead load, so that the rest surface is in equilibrium without contact.
 
     Args:
-        membrane: at rest.
+        membrane: the membrane at rest.
         elasticity: its elastic energy.
-        paths: for each indenter its poses, all equally many: `[[ball.at(a), ball.at(b)]]` moves one ball from a to b, straight
-            between two poses. Start outside (`ball.touching(membrane, direction)`) or lightly touching.
-        filling: "liquid" (volume kept), "gas" (absolute pressure x volume kept) or "open" (pressure stays at rest).
-        gas: for a gas its absolute pressure at rest (force / length^2) and volume (length^3).
+        paths: the poses of each indenter, the same number for all: `[[ball.at(a), ball.at(b)]]` moves one ball from a to b, in
+            a straight line between two poses. Start outside (`ball.touching(membrane, direction)`) or in light contact.
+        filling: "liquid" (constant volume), "gas" (constant product of absolute pressure and volume) or "open" (constant
+            pressure).
+        gas: for a gas, its absolute pressure at rest (force / length^2) and its volume (length^3).
         friction: Coulomb's coefficient mu.
-        increment: longest travel in one step; default: size / 100 with friction, whose answer depends on it, else size / 10.
+        increment: longest travel in one step; default: size / 100 with friction, whose result depends on it, otherwise size /
+            10.
 
     Yields:
         The equilibrium at each pose.
 
     Raises:
-        MembraneError: no equilibrium is found, also in small steps; an unconverged state is never given.
+        MembraneError: no equilibrium is found, even in small steps; unconverged states are never returned.
 
     Limitations:
-        Vertices are kept out of indenters, edges between them are not: an indenter's features should be coarser than the grid.
-        Friction on an edge or corner of a `MeshIndenter` that meets a vertex exactly has no normal to settle on: move it a
-        little.
+        Vertices are kept outside indenters, edges between them are not: an indenter's features should be coarser than the grid.
+        With friction, the solver cannot settle on a normal where an edge or corner of a `MeshIndenter` meets a vertex exactly;
+        move the indenter slightly.
 
     Example:
         >>> from torchmembrane.simulate import Sphere
@@ -147,17 +149,17 @@ def presses(
 
 
 def carried(x: Tensor, membrane: Membrane, positions: Tensor | np.ndarray) -> Tensor:
-    """Where material points are on a deformed surface: `X_d + W (x - X)`.
+    """Return the positions of material points on a deformed surface: `X_d + W (x - X)`.
 
-    They move with the closest points of the rest surface, by barycentric weights W.
+    The points move with the closest points of the rest surface, by barycentric weights W.
 
     Args:
-        x: the deformed surface, `[..., V, 3]`.
-        membrane: at rest.
-        positions: the points at rest, `[D, 3]`.
+        x: vertices of the deformed surface, `[..., V, 3]`.
+        membrane: the membrane at rest.
+        positions: positions of the points at rest, `[D, 3]`.
 
     Returns:
-        Their positions, `[..., D, 3]`.
+        Positions on the deformed surface, `[..., D, 3]`.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -192,7 +194,7 @@ def _moved(
     poses: Sequence[Indenter],
     increment: float,
 ) -> tuple[Tensor, float, Sequence[FrictionalContact], int]:
-    """Equilibrium at the next poses, reached by increments that are halved where Newton's method fails."""
+    """Find the equilibrium at the next poses, by increments that are halved where Newton's method fails."""
     starts, size = [contact.indenter for contact in contacts], problem.membrane.size
     travel = max(_travel(start, pose, size) for start, pose in zip(starts, poses, strict=True))
     longest = 1 / max(1, int(np.ceil(travel / increment)))
@@ -217,7 +219,7 @@ def _moved(
 
 
 def _travel(start: Indenter, end: Indenter, lever: float) -> float:
-    """Translation plus the turn on a `lever` (length) between two poses."""
+    """Return the length of the translation plus that of the rotation on a `lever` (length) between two poses."""
     cosine = (torch.einsum("ij,ij->", start.rotation, end.rotation) - 1) / 2
     return float((end.translation - start.translation).norm() + lever * cosine.clamp(-1, 1).acos())
 

@@ -1,4 +1,4 @@
-"""Rasterisation: the visible triangle of a projected mesh at every sample, and values that are linear on triangles.
+"""Rasterisation: the visible triangle of a projected mesh at each sample, and values that are linear on triangles.
 
 All triangles are cut into spans of rows at once.
 """
@@ -10,22 +10,22 @@ from torch import Tensor
 
 
 def visible_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
-    """The nearest triangle that covers each point `(u, v)` of a grid of `height x width` integers.
+    """Return the nearest triangle that covers each point `(u, v)` of a grid of `height x width` integers.
 
     A triangle covers the points on its edges that face left or up, so that neighbours neither overlap nor leave gaps.
 
     Args:
-        corners: `[T, 3, 2]`. Only triangles that turn from +u to +v are visible, which those of an outward surface do from
-            inside, and none with a corner that is NaN.
-        depth: `[T]`, one for each triangle.
+        corners: corners of the triangles, `[T, 3, 2]`. Only triangles whose corners turn from +u to +v are visible, as those of
+            an outward surface seen from inside, and none with a NaN corner.
+        depth: depth of each triangle, `[T]`.
         width: width of the image.
         height: height of the image.
 
     Returns:
-        Indices of triangles, int64 `[height, width]`, -1 where there is none.
+        Indices of triangles, int64 `[height, width]`, -1 where there is no triangle.
 
     Limitations:
-        Triangles that pierce each other are ordered by `depth`, not at every point.
+        Triangles that intersect each other are ordered by `depth`, not at each point.
 
     Example:
         >>> corners = torch.tensor([[[0.0, 0], [3, 0], [0, 3]]])
@@ -50,9 +50,9 @@ def visible_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -
 
 
 def _spans(corners: Tensor, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Every row that a triangle meets: triangle, row, and the u between which it lies there, `[S]` each.
+    """Return every row that a triangle crosses: triangle, row, and the two u between which it lies there, `[S]` each.
 
-    Edges are followed from their upper end, by whichever triangle, so that both triangles of an edge have it at the same u.
+    Edges are evaluated from their upper end in every triangle, so that both triangles of an edge have it at the same u.
     """
     corners = corners.gather(1, corners[..., 1].argsort(dim=1, stable=True)[..., None].expand(-1, -1, 2))
     top, middle, bottom = corners.unbind(1)
@@ -69,13 +69,13 @@ def _spans(corners: Tensor, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor
 
 
 def _line(upper: Tensor, lower: Tensor) -> Tensor:
-    """`(u, v, du/dv)` of the edge that goes down from `upper [T, 2]` to `lower [T, 2]`."""
+    """Return `(u, v, du/dv)` of the edge that goes down from `upper [T, 2]` to `lower [T, 2]`."""
     du, dv = (lower - upper).unbind(-1)
     return torch.cat([upper, (du / torch.where(dv > 0, dv, 1.0))[:, None]], -1)
 
 
 def _u_at(line: Tensor, v: Tensor) -> Tensor:
-    """The u of lines `[S, 3]` at `v [S]`."""
+    """Return the u of lines `[S, 3]` at `v [S]`."""
     return line[:, 0] + (v - line[:, 1]) * line[:, 2]
 
 
@@ -83,9 +83,9 @@ class LinearOnTriangles(NamedTuple):
     """Values that are linear on triangles in the image: `value + slope (place - corner)`, float32.
 
     Attributes:
-        value: `[T, C]`, at each triangle's first corner.
-        slope: `[T, C, 2]`, their derivative in the image.
-        corner: `[T, 2]`, the first corner.
+        value: values at the first corner of each triangle, `[T, C]`.
+        slope: derivatives of the values in the image, `[T, C, 2]`.
+        corner: first corner of each triangle, `[T, 2]`.
     """
 
     value: Tensor
@@ -94,7 +94,7 @@ class LinearOnTriangles(NamedTuple):
 
     @classmethod
     def from_corners(cls, corners: Tensor, values: Tensor) -> "LinearOnTriangles":
-        """From corners `[T, 3, 2]` and the values there `[T, 3, C]`."""
+        """Construct from corners `[T, 3, 2]` and the values at them, `[T, 3, C]`."""
         (a, b), (c, d) = ((corners[:, k] - corners[:, 0]).unbind(-1) for k in (1, 2))
         det = a * d - b * c
         inverse = torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2)) / torch.where(det == 0, 1.0, det)[:, None, None]
@@ -102,7 +102,7 @@ class LinearOnTriangles(NamedTuple):
         return cls(values[:, 0].float(), (rise @ inverse.mT).float(), corners[:, 0].float())
 
     def at(self, triangle: Tensor, place: Tensor) -> Tensor:
-        """Values `[S, C]` at the points `place [S, 2]` of the image in `triangle [S]`."""
+        """Return the values `[S, C]` at points `place [S, 2]` of the image, each in `triangle [S]`."""
         value, slope, corner = (field.index_select(0, triangle) for field in self)  # faster than by brackets
         step = place - corner
         return value + (slope[..., 0] * step[:, :1] + slope[..., 1] * step[:, 1:])

@@ -1,7 +1,8 @@
 """Images of a deformed membrane as its camera sees them: the pattern on the material, light, lens and chip.
 
-The surface is refined by bicubic splines until its facets are about as small as pixels, projected, and sampled `s x s` times a
-pixel; each sample finds the triangle that is visible there and, linear in it, place on the material and brightness.
+The surface is refined by bicubic splines until its facets are about the size of pixels, projected, and sampled at `s x s`
+points per pixel. For each sample, the visible triangle is found; the position on the material and the brightness are linear in
+it.
 """
 
 import copy
@@ -26,12 +27,12 @@ FINEST_GRID = 513
 
 
 class RenderedDots(NamedTuple):
-    """Dots of a deformed membrane.
+    """The dots of a deformed membrane.
 
     Attributes:
-        positions: positions of their centres, `[..., D, 3]`; of dots at a height of their tips.
-        pixels: pixels of their centres, `[..., D, 2]`.
-        visible: `[..., D]` bool, in the image and not hidden.
+        positions: positions of the centres, `[..., D, 3]`; for pins, of their tips.
+        pixels: pixels of the centres, `[..., D, 2]`.
+        visible: `[..., D]` bool, whether each is inside the image and not occluded.
     """
 
     positions: Tensor
@@ -41,17 +42,17 @@ class RenderedDots(NamedTuple):
 
 @check_arguments
 class Renderer(nn.Module):
-    """Images of one sensor.
+    """Renders images of one sensor.
 
     Args:
-        sensor: camera, rest surface, and the markers from which comes the default pattern.
-        grid: `(m, n)` of the vertices that will be drawn; default: the sensor's solver grid.
+        sensor: sensor with camera, rest surface, and the markers that define the default pattern.
+        grid: grid `(m, n)` of the vertices to be rendered; default: the sensor's solver grid.
         pattern: `Dots`, `Speckle` or `Painted`; default: `pattern_of(sensor)`.
-        appearance: light, lens and chip; noise is not added here (see `noisy`).
-        samples: s, along a pixel's side.
+        appearance: lighting, lens and image sensor; noise is not added here (see `noisy`).
+        samples: number of samples s along a pixel's side.
 
     Raises:
-        MembraneError: the rest surface is nowhere in the image.
+        MembraneError: no part of the rest surface lies in the image.
 
     Example:
         >>> from torchmembrane.presets import preset
@@ -99,7 +100,7 @@ class Renderer(nn.Module):
         self._paint(pattern)
 
     def _expose(self) -> None:
-        """Scale the light so that the white membrane at rest is as grey as asked."""
+        """Scale the light so that the white membrane at rest has the requested grey value."""
         X, pixels = self.surface.rest, self.camera.point_to_pixel(self.surface.rest)
         visible = ((pixels > -0.5) & (pixels < pixels.new_tensor(self.camera.image_size) - 0.5)).all(-1)
         if not visible.any():
@@ -111,7 +112,7 @@ class Renderer(nn.Module):
         self.register_buffer("rest_pixels", pixels)
 
     def _paint(self, pattern: Dots | Speckle | Painted) -> None:
-        """Reflectances of the ground, and which triangles bear ink."""
+        """Set the reflectances of the ground, and mark the triangles that contain ink."""
         X, corners = self.surface.rest, self.surface.rest[self.surface.triangles]
         white = self._light(X)[..., 0] * vignette(self.rest_pixels, self.camera, self.appearance.vignetting)
         self.register_buffer("albedo", pattern.albedo(Canvas(X, self.rest_pixels, white)))
@@ -136,7 +137,7 @@ class Renderer(nn.Module):
         self.register_buffer("dot_row", inked.cumsum(0) - 1)
 
     def fine_vertices(self, vertices: Tensor) -> Tensor:
-        """The refined surface that is drawn: displacements by bicubic splines, `[..., V, 3]` to `[..., W, 3]`.
+        """Return the refined surface to be drawn: displacements by bicubic splines, `[..., V, 3]` to `[..., W, 3]`.
 
         Raises:
             MembraneError: the vertices are not on the renderer's grid.
@@ -151,7 +152,7 @@ class Renderer(nn.Module):
         return self.surface.rest + fine.flatten(-3, -2)
 
     def dots(self, vertices: Tensor) -> RenderedDots:
-        """Where the centres of the pattern's dots are and which of them are visible, of the membrane at `[..., V, 3]`."""
+        """Return the centres of the pattern's dots on the membrane at `[..., V, 3]`, and which of them are visible."""
         x = self.fine_vertices(vertices)
         positions, inward = self._standing(x)
         pixels = self.camera.point_to_pixel(positions)
@@ -162,15 +163,15 @@ class Renderer(nn.Module):
         return RenderedDots(positions, pixels, visible & ~turned)
 
     def _standing(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Centres of the dots, or of their tips, on the refined surface `x [..., W, 3]`, and its inward normals under them,
-        `[..., D, 3]` each."""
+        """Return the centres of the dots, or of their tips, on the refined surface `x [..., W, 3]`, and the inward normals
+        under them, `[..., D, 3]` each."""
         fields = x - self.surface.rest, self.surface.normals(x)
         displacement, outward = ((a[..., self.dot_vertices, :] * self.dot_weights[..., None]).sum(-2) for a in fields)
         inward = -F.normalize(outward, dim=-1)
         return self.dot_rest + displacement + self.heights[:, None] * inward, inward
 
     def forward(self, vertices: Tensor) -> Tensor:
-        """Images without noise.
+        """Render images without noise.
 
         Args:
             vertices: vertices of the membrane on the grid, `[..., V, 3]`.
@@ -188,13 +189,13 @@ class Renderer(nn.Module):
         return blurred(images, self.appearance.blur).clamp(0, 1)
 
     def depth(self, vertices: Tensor) -> Tensor:
-        """Depth images of the membrane: z along the axis of what is visible at each pixel's centre.
+        """Render depth images of the membrane: z along the optical axis of what is visible at each pixel's centre.
 
         Args:
             vertices: vertices of the membrane on the grid, `[..., V, 3]`.
 
         Returns:
-            Depths, length unit, `[..., H, W]`; NaN beside the membrane.
+            Depths, length unit, `[..., H, W]`; NaN outside the membrane.
         """
         images = [self._depth(x) for (x,) in _each(self.fine_vertices(vertices))]
         return torch.stack(images).view(*vertices.shape[:-2], *images[0].shape)
@@ -210,7 +211,7 @@ class Renderer(nn.Module):
         return image
 
     def _light(self, x: Tensor) -> Tensor:
-        """Grey of a white membrane and of the highlights on it, `[..., W, 2]`."""
+        """Return the grey value of a white membrane and of the highlights on it, `[..., W, 2]`."""
         appearance, inward = self.appearance, -self.surface.normals(x)
         direct = diffuse_light(x, inward, self.lights) / self.unit_light
         shine = torch.zeros_like(direct)
@@ -221,14 +222,15 @@ class Renderer(nn.Module):
         )
 
     def _visible(self, x: Tensor, samples: int) -> tuple[Tensor, Tensor]:
-        """Corners `[T, 3, 2]` of the projected triangles in samples, and which of them is visible in each, `[H s, W s]`."""
+        """Return the corners `[T, 3, 2]` of the projected triangles in samples, and the visible one at each sample,
+        `[H s, W s]`."""
         width, height = self.camera.image_size
         corners = ((self.camera.point_to_pixel(x) + 0.5) * samples - 0.5)[self.surface.triangles]
         depth = x.norm(dim=-1)[self.surface.triangles].mean(-1)
         return corners, visible_triangles(corners, depth, samples * width, samples * height)
 
     def _visible_range(self, x: Tensor, pixels: Tensor) -> Tensor:
-        """Range of what is visible at `pixels [D, 2]`: the farthest of the 3 x 3 pixels around each, `[D]`."""
+        """Return the range of what is visible at `pixels [D, 2]`: the farthest of the 3 x 3 pixels around each, `[D]`."""
         _, visible = self._visible(x, samples=1)
         ranges = F.pad(x.norm(dim=-1)[self.surface.triangles].mean(-1), (0, 1), value=torch.inf)[visible]
         last = torch.tensor(visible.shape[::-1], device=visible.device) - 1
@@ -238,7 +240,7 @@ class Renderer(nn.Module):
         return ranges[v, u].amax(0)
 
     def _sharp(self, x: Tensor, light: Tensor) -> Tensor:
-        """One image `[H, W]` before lens and chip: the mean of the samples of each pixel."""
+        """Return one image `[H, W]` before blur and noise: the mean of the samples of each pixel."""
         corners, visible = self._visible(x, self.samples)
         sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
         triangle = visible.view(-1).index_select(0, sample)
@@ -279,15 +281,15 @@ def render(
     appearance: Appearance = DEFAULT_APPEARANCE,
     samples: int = 4,
 ) -> Tensor:
-    """Images of a sensor's membrane.
+    """Render images of a sensor's membrane.
 
     Args:
-        sensor: as of `Renderer`, as are the other arguments.
+        sensor: the sensor; all arguments are those of `Renderer`.
         vertices: vertices of the membrane on the grid, `[..., V, 3]`.
         grid: grid of the vertices.
-        pattern: on the membrane.
-        appearance: light, lens and chip.
-        samples: along a pixel's side.
+        pattern: pattern on the membrane.
+        appearance: lighting, lens and image sensor.
+        samples: number of samples along a pixel's side.
 
     Returns:
         Images, `[..., H, W]`, float32 in 0..1.
@@ -296,7 +298,7 @@ def render(
 
 
 def _fine_grid(sensor: Sensor, cell: float) -> tuple[int, int]:
-    """The grid whose lines at rest are crossed by others every `cell` px at most, where they are longest."""
+    """Return the grid whose lines at rest are crossed at most `cell` px apart, where they are longest."""
     m, n = sensor.membrane.grid
     pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).unflatten(0, (m, n))
     steps = [pixels.diff(dim=axis).norm(dim=-1).nan_to_num(0.0).amax(1 - axis).sum() for axis in (0, 1)]
@@ -305,11 +307,11 @@ def _fine_grid(sensor: Sensor, cell: float) -> tuple[int, int]:
 
 
 def _spline_matrix(coarse: int, fine: int) -> Tensor:
-    """Weights `[fine, coarse]` of cubic interpolation from evenly spaced values to as even, finer ones."""
+    """Return weights `[fine, coarse]` of cubic interpolation between uniformly spaced values and finer, uniform ones."""
     spline = make_interp_spline(np.arange(coarse), np.eye(coarse), k=3)
     return torch.from_numpy(spline(np.linspace(0, coarse - 1, fine)))
 
 
 def _each(*batches: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """The images of a batch one by one: an image is some million samples, enough to keep any device busy."""
+    """Yield the images of a batch one by one: one image has some million samples, enough to keep any device busy."""
     return zip(*(batch[None].flatten(0, -3) for batch in batches), strict=True)
