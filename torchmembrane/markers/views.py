@@ -1,4 +1,4 @@
-"""Markers that several views see: each view has its own locator, rest image and noise; what they show is listed view by view.
+"""Markers seen by several views: each view has its own locator, rest image and noise, and the results are listed view by view.
 
 Of W views of D markers there are `N = W D` sightings: all markers in the first view, then all in the second, and so on.
 """
@@ -18,21 +18,21 @@ from ..results.status import Status
 from .observer import MarkerFlow, MarkerObserver, RestState
 
 BY_GRAVITY = (Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UNLIKE_REST)
-"""Of views that all fail: the first of these that one of them has is the frame's."""
+"""Statuses in order of precedence if all views fail: the frame gets the first of these that a view has."""
 
 
 MEETING = 1.0
-"""px by which the point that two views' rays come closest to may miss the marker in both images."""
+"""px by which the point closest to two views' rays may miss the marker in either image."""
 
 
 class ViewsObserver(nn.Module):
-    """Images of all views to what their markers show; as `MarkerObserver`, of sightings.
+    """Measures the markers in the images of all views, like `MarkerObserver` but for all sightings.
 
     Args:
-        observers: of the views.
-        names: of the views, for messages.
-        regions: left, top, width, height of each view in the image that they share; None: each has a channel of its own.
-        rig: the views' cameras.
+        observers: observers of the views.
+        names: names of the views, for messages.
+        regions: left, top, width and height of each view in the image that they share; None: each has a channel of its own.
+        rig: cameras of the views.
     """
 
     principal: Tensor
@@ -56,32 +56,32 @@ class ViewsObserver(nn.Module):
 
     @property
     def rest_pixels(self) -> Tensor:
-        """Where the model sees the markers at rest, `[N, 2]` px."""
+        """Return the model's pixels of the markers at rest, `[N, 2]`."""
         return self._joined("rest_pixels")
 
     @property
     def measured_rest(self) -> Tensor:
-        """Where they are in the rest images, `[N, 2]` px."""
+        """Return the pixels of the markers in the rest images, `[N, 2]`."""
         return self._joined("measured_rest")
 
     @property
     def rest_covariance(self) -> Tensor:
-        """Their noise there, `[N, 2, 2]` px^2."""
+        """Return the covariance of their noise in the rest images, `[N, 2, 2]` px^2."""
         return self._joined("rest_covariance")
 
     @property
     def seen_at_rest(self) -> Tensor:
-        """Which of the sightings there are at rest, `[N]` bool."""
+        """Return which sightings exist at rest, `[N]` bool."""
         return self._joined("seen_at_rest")
 
     def with_rays(self, pixels: Tensor, confidence: Tensor) -> Tensor:
-        """Pixels `[B, N, 2]`, those without confidence `[B, N]` at their view's principal point: a view may have no ray for a
-        marker that it does not see, and no weight makes a number of what is none."""
+        """Return pixels `[B, N, 2]`, with the principal point for those without confidence `[B, N]`: a view may have no ray for
+        a marker that it does not see, and a weight of zero would not remove the resulting NaN."""
         return torch.where((confidence > 0)[..., None], pixels, self.principal.to(pixels))
 
     @property
     def follows(self) -> bool:
-        """Whether markers are looked for first where they were in the frame before."""
+        """Return whether the search for markers starts at their pixels in the preceding frame."""
         return all(observer.follows for observer in self.each)
 
     def be_exact(self) -> None:
@@ -90,21 +90,21 @@ class ViewsObserver(nn.Module):
             observer.be_exact()  # type: ignore[operator]
 
     def by_view(self, values: Tensor) -> Tensor:
-        """Values `[B, N, ...]` as `[B, W, D, ...]`."""
+        """Reshape values `[B, N, ...]` to `[B, W, D, ...]`."""
         return values.unflatten(1, (self.views, self.count))
 
     @traced
     def sighted(self, values: Tensor) -> Tensor:
-        """Values `[B, W, D, ...]` as `[B, N, ...]`."""
+        """Reshape values `[B, W, D, ...]` to `[B, N, ...]`."""
         return values.flatten(1, 2)
 
     def seen_by_each(self, values: Tensor) -> Tensor:
-        """Values of the markers, `[..., D, C]`, for each sighting, `[..., N, C]`."""
+        """Repeat values of the markers, `[..., D, C]`, for each sighting, `[..., N, C]`."""
         return torch.cat([values] * self.views, -2)
 
     def images(self, grey: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
-        """Each view's images `[B, 1, height, width]`, of grey images `[B, 1, ...]` of the regions, or `[B, W, ...]`; a sequence
-        of these is taken as it is."""
+        """Return each view's images `[B, 1, height, width]`, from grey images `[B, 1, ...]` of the regions or `[B, W, ...]`; a
+        sequence of images is returned unchanged."""
         return self._parts(grey) if isinstance(grey, (Tensor, Value)) else grey
 
     @traced
@@ -117,15 +117,16 @@ class ViewsObserver(nn.Module):
     def forward(
         self, images: Tensor | Sequence[Tensor], previous: Tensor | None = None, rest_pixels: Tensor | None = None
     ) -> MarkerFlow:
-        """What grey images show, as of `MarkerObserver`; `status [B, W]` is each view's."""
+        """Measure the markers in grey images, as `MarkerObserver`; `status [B, W]` has one entry for each view."""
         befores, rests = self._split(previous, 1), self._split(rest_pixels, 0)
         each = zip(self.each, self.images(images), befores, rests, strict=True)
         return self._together([observer(*given) for observer, *given in each])
 
     def from_pixels(self, pixels: Any, confidence: Any, rest_pixels: Any, noise: float | None = None) -> MarkerFlow:
-        """What markers located elsewhere show; `pixels [B, W, D, 2]` or `[W, D, 2]`, `confidence` and `rest_pixels` alike.
+        """Measure markers located elsewhere; `pixels [B, W, D, 2]` or `[W, D, 2]`, `confidence` and `rest_pixels` likewise.
 
-        A marker keeps its confidence where its neighbours in the view bear it out, or another view that it is the same point.
+        A marker keeps its confidence if its neighbours in the view confirm it, or if another view confirms that it is the same
+        point.
         """
         pixels, shape = tensor_of("from_pixels: pixels", pixels), (self.views, self.count, 2)
         pixels = pixels[None] if pixels.ndim == 3 else pixels
@@ -145,8 +146,8 @@ class ViewsObserver(nn.Module):
 
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
-        """Displacements, confidence and status `[B]`: a view that fails is left out where another one does not, and so is a
-        marker that a view does not see at rest, of which it knows no displacement."""
+        """Return displacements, confidence and status `[B]`. A view that fails is left out if another one does not, and so are
+        markers that a view does not see at rest, whose displacement is unknown to it."""
         confidence = confidence * self.seen_at_rest
         parts = zip(
             *(self.by_view(each).unbind(1) for each in (displacement, confidence, covariance)), status.unbind(1), strict=True
@@ -161,30 +162,30 @@ class ViewsObserver(nn.Module):
         return flow._replace(status=torch.where(fails.all(1), gravest, left_out))
 
     def rest_of(self, images: Tensor) -> RestState:
-        """The markers in grey images without contact, as of `MarkerObserver`, of all sightings."""
+        """Return the markers of all sightings in grey images without contact, as `MarkerObserver.rest_of`."""
         rests = [observer.rest_of(part) for observer, part in zip(self.each, self.images(images), strict=True)]  # type: ignore[operator]
         return RestState(*map(torch.cat, zip(*rests, strict=True)))
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels `[B, N, 2]` of the markers in grey images, and which of them are found `[B, N]`."""
+        """Return the pixels `[B, N, 2]` of the markers in grey images, and which of them are found, `[B, N]`."""
         found = [observer.locate(part) for observer, part in zip(self.each, self.images(images), strict=True)]  # type: ignore[operator]
         pixels, is_found = zip(*found, strict=True)
         return torch.cat(pixels, 1), torch.cat(is_found, 1)
 
     def check_rest(self, name: str) -> None:
-        """Refuse a rest image that disagrees with the model by more than calibration could explain."""
+        """Refuse a rest image that deviates from the model by more than a calibration error could explain."""
         for view, observer in zip(self.names, self.each, strict=True):
             observer.check_rest(f"{name}, view {view}")  # type: ignore[operator]
 
     def rest_given(self, rest_pixels: Any) -> Tensor:
-        """The markers at rest as a caller gives them, `[W, D, 2]` or `[N, 2]` px, as sightings."""
+        """Convert the markers at rest given by a caller, `[W, D, 2]` or `[N, 2]` px, to sightings."""
         rest = tensor_of("rest_pixels", rest_pixels).to(self.rest_pixels)
         if rest.shape[-1:] != (2,) or rest.numel() != 2 * self.views * self.count:
             raise MembraneError(f"rest_pixels {list(rest.shape)}; expected [{self.views}, {self.count}, 2], of each view")
         return rest.reshape(-1, 2)
 
     def before(self, previous: Any, frames: int) -> Tensor:
-        """Pixels `[B, N, 2]` of a previous result, refused where it cannot be one of these frames'."""
+        """Return the pixels `[B, N, 2]` of a previous result, after checking that it fits these frames."""
         given, expected = getattr(previous, "pixels", None), [frames, self.views, self.count, 2]
         if not isinstance(given, Tensor) or list(given.shape) != expected:
             came = f"pixels {list(given.shape)}" if isinstance(given, Tensor) else f"no pixels: a {type(previous).__name__}"
@@ -204,13 +205,13 @@ class ViewsObserver(nn.Module):
 
 
 def met_by_another(rig: Rig, pixels: Tensor, is_seen: Tensor) -> Tensor:
-    """Which sightings of markers show the same point as another view: their rays meet.
+    """Return which sightings show the same point as another view, because their rays meet.
 
-    A marker that is taken for another one rarely passes: its pixel would have to lie beside the other view's epipolar line.
+    A mistaken marker rarely passes: its pixel would have to lie close to the other view's epipolar line.
 
     Args:
-        rig: the W views' cameras.
-        pixels: `[B, W, D, 2]`, with a ray each.
+        rig: cameras of the W views.
+        pixels: `[B, W, D, 2]`, all with a viewing ray.
         is_seen: `[B, W, D]` bool.
 
     Returns:
@@ -239,7 +240,8 @@ def met_by_another(rig: Rig, pixels: Tensor, is_seen: Tensor) -> Tensor:
 
 
 def _nearest_point(o: Tensor, d: Tensor, p: Tensor, e: Tensor) -> Tensor:
-    """The middle `[..., 3]` between two lines through `o` and `p` along unit vectors `d` and `e`, where they are nearest."""
+    """Return the midpoint `[..., 3]` of the shortest segment between lines through `o` and `p` along unit vectors `d` and
+    `e`."""
     along = (d * e).sum(-1, keepdim=True)
     from_o, from_p = ((p - o) * d).sum(-1, keepdim=True), ((p - o) * e).sum(-1, keepdim=True)
     apart = (1 - along**2).clamp_min(torch.finfo(d.dtype).eps)

@@ -1,4 +1,4 @@
-"""Figures of what a calibration found: residuals, correlations, a surface's correction, a material's likelihood, a layout."""
+"""Figures of calibration results: residuals, correlations, surface correction, material likelihood, dot layout."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ GAINS = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])
 
 
 def fit_figure(report: Report, image_size: tuple[int, int]) -> Figure:
-    """Residuals in the image (arrows, magnified), their scatter, and the correlations of what was fitted.
+    """Draw the residuals in the image (magnified arrows), their scatter, and the correlations of the fitted parameters.
 
     Args:
         report: the calibration's numbers.
@@ -36,7 +36,7 @@ def fit_figure(report: Report, image_size: tuple[int, int]) -> Figure:
 
 
 def draw_residuals(axes: Axes, report: Report, image_size: tuple[int, int]) -> None:
-    """Residuals as arrows at their pixels, magnified by the largest of `GAINS` that keeps them short."""
+    """Draw residuals as arrows at their pixels, magnified by the largest of `GAINS` that keeps them short."""
     width, height = image_size
     typical = np.sqrt((report.residuals**2).sum(-1).mean()) if len(report.residuals) else 1.0
     gain = max(GAINS[GAINS <= max(1.0, 0.03 * width / max(typical, 1e-9))])
@@ -46,7 +46,7 @@ def draw_residuals(axes: Axes, report: Report, image_size: tuple[int, int]) -> N
 
 
 def draw_scatter(axes: Axes, report: Report) -> None:
-    """Residuals as points, with circles of one and three standard deviations of the noise."""
+    """Draw residuals as points, with circles of one and three standard deviations of the noise."""
     angle = np.linspace(0, 2 * np.pi, 200)
     axes.plot(*report.residuals.T, ".", ms=2, color=BLUE)
     for times in (1, 3):
@@ -57,7 +57,7 @@ def draw_scatter(axes: Axes, report: Report) -> None:
 
 
 def draw_correlations(axes: Axes, report: Report) -> None:
-    """The matrix of correlations of the first `PARAMETERS_DRAWN` parameters."""
+    """Draw the correlation matrix of the first `PARAMETERS_DRAWN` parameters."""
     names = report.names[:PARAMETERS_DRAWN]
     n = len(names)
     shown = axes.imshow(report.correlations[:n, :n], vmin=-1, vmax=1, cmap="RdBu")
@@ -68,13 +68,13 @@ def draw_correlations(axes: Axes, report: Report) -> None:
 
 
 def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarray, correction: Any, unit: str) -> Figure:
-    """The residuals in the image, if there are any, and the correction of the surface with its standard deviation, seen along
-    the axis.
+    """Draw the residuals in the image, if there are any, and the correction of the surface with its standard deviation, viewed
+    along the axis.
 
     Args:
         report: the calibration's numbers.
         image_size: width and height of the image, px.
-        places: `[V, 3]`, the surface's vertices.
+        places: vertices of the surface, `[V, 3]`.
         correction: its `offsets [V]` along the normals and their `deviations [V]`.
         unit: unit of lengths.
 
@@ -107,7 +107,7 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
 
 
 def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
-    """Losses over the prestretch with the estimate, and forces, or pressures, found over those measured where there are any.
+    """Draw the loss over the prestretch with the estimate, and the reconstructed forces or pressures over those measured.
 
     Args:
         report: the calibration's numbers, the prestretch first.
@@ -155,11 +155,11 @@ def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
 
 
 def layout_figure(title: str, sensor: Sensor, dots: Any) -> Figure:
-    """The wanted pattern in the image, and its dots on the rest surface, from above and from the side.
+    """Draw the wanted pattern in the image, and its dots on the rest surface from above and from the side.
 
     Args:
         title: title of the figure.
-        sensor: the sensor that is to bear the dots.
+        sensor: the sensor for which the dots are designed.
         dots: their `pixels [D, 2]` as wanted, `positions [D, 3]` on the rest surface and `radii [D]`.
 
     Example:

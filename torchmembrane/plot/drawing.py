@@ -1,6 +1,6 @@
-"""Common parts of figures: colours, rows of panels, axes in pixels and in lengths, grids as lines; showing.
+"""Common elements of figures: colours, rows of panels, axes in pixels and lengths, grids as lines, and display.
 
-A figure here is a matplotlib `Figure` that belongs to no window, so that drawing needs no display.
+A figure is a matplotlib `Figure` without a window, so that drawing needs no display.
 """
 
 import numpy as np
@@ -16,16 +16,16 @@ BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any col
 Grid = tuple[int, int] | np.ndarray
 
 readable = rc_context({"font.size": 13, "axes.titlesize": 14.5, "axes.titlepad": 9})
-"""Decorates what draws a figure: its letters can be read where a page shows it at half its width."""
+"""Decorate a function that draws a figure: its text stays legible at half the page's width."""
 ROW = 6.0  # inches, of a row of panels
 ABOVE, UNDER = 0.9, 1.3  # of it: the headline and titles of two lines; labels and a legend of two rows
 TITLE = 0.6  # inches, of the titles of a further row
 SHORT = (-2, 3)  # powers of ten of lengths whose ticks are written in full: a membrane in um or m has its power beside the axis
-LINES = 16  # of a grid that are drawn each way, at most about
+LINES = 16  # approximate largest number of grid lines drawn in each direction
 
 
 def show(drawing: Figure) -> None:
-    """Open a window with the figure and wait until it is closed."""
+    """Show the figure in a window and wait until it is closed."""
     from matplotlib import pyplot
 
     window = pyplot.figure(figsize=tuple(drawing.get_size_inches()))
@@ -35,7 +35,7 @@ def show(drawing: Figure) -> None:
 
 
 def panels(count: int, below: float = 0.0, rows: int = 1) -> tuple[Figure, GridSpec]:
-    """A figure with places for `count` panels in each of its rows, and `below` them as many inches more."""
+    """Return a figure with places for `count` panels in each of its rows, and `below` inches of extra height."""
     panel, between = ROW - ABOVE - UNDER, UNDER + TITLE
     height = rows * panel + (rows - 1) * between + ABOVE + UNDER + below
     drawing = Figure(figsize=(16 * count / 3, height), dpi=100)
@@ -47,7 +47,7 @@ def panels(count: int, below: float = 0.0, rows: int = 1) -> tuple[Figure, GridS
 
 
 def image_axes(axes: Axes, size: np.ndarray | tuple[int, int], image: np.ndarray | None) -> None:
-    """Axes in pixels of an image of `size` (width, height), v downwards, over the image if there is one."""
+    """Set up axes in pixels of an image of `size` (width, height), v downwards, over the image if there is one."""
     width, height = size
     if image is not None:
         axes.imshow(image, cmap="gray", vmin=-1, vmax=1, interpolation="nearest")
@@ -56,7 +56,7 @@ def image_axes(axes: Axes, size: np.ndarray | tuple[int, int], image: np.ndarray
 
 
 def side_axes(axes: Axes, letter: str, unit: str) -> None:
-    """Axes of a side view: the axis `letter` to the right, z upwards."""
+    """Set up the axes of a side view: the axis `letter` to the right, z upwards."""
     axes.set_aspect("equal", anchor="N")
     axes.margins(0.06)
     axes.set(xlabel=f"{letter} [{unit}]", ylabel=f"z, away from the camera [{unit}]")
@@ -65,32 +65,32 @@ def side_axes(axes: Axes, letter: str, unit: str) -> None:
 
 
 def legend_below(axes: Axes) -> None:
-    """The legend, below the axes."""
+    """Place the legend below the axes."""
     narrow = dict(handlelength=1.4, handletextpad=0.5, columnspacing=1.2)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=3.4, ncols=2, frameon=False, **narrow)
 
 
 def few_lines(points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Points `[V, 2]` of a grid as a lattice `[m, n, 2]` of at most about `LINES` lines each way."""
+    """Return the points `[V, 2]` of a grid as a lattice `[m, n, 2]` of at most about `LINES` lines in each direction."""
     m, n = (max(1, (size - 1) // LINES) for size in grid)
     return points.reshape(*grid, 2)[::m, ::n]
 
 
 def mesh_lines(points: np.ndarray, grid: Grid, **style) -> LineCollection:
-    """Rows and columns of a grid of points `[V, 2]`."""
+    """Return the rows and columns of a grid of points `[V, 2]` as lines."""
     lattice = few_lines(points, grid)
     return LineCollection([*lattice, *lattice.swapaxes(0, 1)], **style)
 
 
 def line_through(vertex: int, X: np.ndarray, grid: Grid, across: int) -> np.ndarray:
-    """Of the row and the column of a vertex the one that runs along the axis `across`: vertex indices."""
+    """Return the vertex indices of the row or column through a vertex, whichever runs along the axis `across`."""
     index = np.arange(len(X)).reshape(grid)
     i, j = divmod(vertex, grid[1])
     return max(index[i], index[:, j], key=lambda line: np.ptp(X[line, across]))
 
 
 def closed_rim(grid: Grid) -> np.ndarray:
-    """Vertex indices once around the grid's border and back to the first.
+    """Return the vertex indices along the grid's border, once around and back to the first.
 
     Example:
         >>> closed_rim((3, 3)).tolist()

@@ -1,4 +1,4 @@
-"""A sequence of figures as a film: a video or an animated GIF."""
+"""A sequence of figures as a video or an animated GIF."""
 
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -23,7 +23,7 @@ RATES, GIF_RATES = (0.001, 1000.0), (0.002, 50.0)
 
 
 def picture_of(drawing: Figure) -> np.ndarray:
-    """A figure's pixels, RGB `[height, width, 3]` uint8.
+    """Return the pixels of a figure, RGB `[height, width, 3]` uint8.
 
     Example:
         >>> picture_of(Figure(figsize=(2, 1), dpi=100)).shape
@@ -39,7 +39,7 @@ def check_film(path: Path, rate: float = 1.0) -> None:
     missing.
 
     Raises:
-        MembraneError: another ending or rate, or PyAV is not installed.
+        MembraneError: the suffix or rate is unsupported, or PyAV is not installed.
     """
     is_gif = path.suffix.lower() == ".gif"
     if not is_gif and path.suffix.lower() not in VIDEOS:
@@ -58,12 +58,12 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], rate: float, la
 
     Args:
         path: `.gif`, or a video (H.264): `.mp4`, `.mov`, `.mkv`; its folder is made if need be.
-        pictures: RGB `[height, width, 3]` uint8, one at least, all of the first one's size.
+        pictures: RGB `[height, width, 3]` uint8, at least one, all of the same size.
         rate: pictures per second.
-        last: seconds for which the last one stays longer, in a GIF, before it begins again.
+        last: additional seconds for which a GIF shows the last picture before it starts again.
 
     Raises:
-        MembraneError: another ending or rate, no picture, one of another size, or PyAV is not installed.
+        MembraneError: the suffix or rate is unsupported, there is no picture, sizes differ, or PyAV is not installed.
 
     Example:
         >>> from tempfile import TemporaryDirectory

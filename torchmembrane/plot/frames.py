@@ -84,7 +84,8 @@ def figure(
 
 
 def draw_flow(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None) -> None:
-    """Circles where markers are at rest, arrows to where they are now (thinned and magnified if need be), lost markers."""
+    """Draw circles at the markers' rest pixels and arrows to their present ones (thinned and magnified if needed); mark lost
+    ones."""
     image_axes(axes, mesh.image_size, image)
     rest, now = mesh.rest_pixels[0] if mesh.views else mesh.rest_pixels, of_first_view(frame, "pixels")
     lost = ~np.isfinite(now).all(1)
@@ -116,7 +117,7 @@ def draw_flow(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh, image: np.nd
 
 
 def draw_side(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
-    """The deformed mesh over crosses at the rest vertices, seen from the side that shows the deepest point."""
+    """Draw the deformed mesh over crosses at the rest vertices, from the side that shows the deepest point."""
     x, X, (m, n) = frame["vertices"], mesh.rest_vertices, mesh.grid
     pressed = _is_pressed(mesh, frame)
     vertex = int(mesh.normal_displacement(frame).argmin()) if pressed else m // 2 * n + n // 2
@@ -151,7 +152,7 @@ def _times_as_high(points: np.ndarray) -> int:
 
 
 def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
-    """Displacement along the rest normals where the rest vertices lie in the image; deepest point o, contacts x."""
+    """Draw the displacement along the rest normals at the rest vertices in the image; deepest point o, contacts x."""
     depth, place, unit = mesh.normal_displacement(frame), mesh.vertex_pixels, mesh.length_unit
     limit = max(np.abs(depth).max(), least_displacement(mesh))
     triangulation = Triangulation(place[:, 0], place[:, 1], mesh.triangles)
@@ -179,7 +180,7 @@ def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> N
 
 
 def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
-    """Compressive normal traction where the rest vertices lie in the image; contacts x, and the total force as an arrow."""
+    """Draw the compressive normal traction at the rest vertices in the image, contacts x, and the total force as an arrow."""
     compressive, place = -(frame["traction"] * frame["normals"]).sum(1), mesh.vertex_pixels
     levels = np.linspace(0, 1.001 * max(compressive.max(), np.finfo(np.float32).tiny), 32)
     shades = axes.tricontourf(
@@ -210,7 +211,7 @@ def _pressure_unit(mesh: Mesh) -> str:
 
 
 def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = None) -> Colorbar:
-    """A flat bar below the axes, as wide whatever their width is."""
+    """Add a flat bar below the axes, of a width independent of theirs."""
     foot = ScaledTranslation(0.5, 0, axes.transAxes)  # type: ignore[arg-type]
     inches = axes.figure.dpi_scale_trans + foot
     place = axes.inset_axes((-BAR_WIDTH / 2, -BAR_BELOW - BAR_HEIGHT, BAR_WIDTH, BAR_HEIGHT), transform=inches)
@@ -220,7 +221,7 @@ def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = No
 
 
 def least_displacement(mesh: Mesh) -> float:
-    """The displacement below which nothing is marked; the colour scale never covers less."""
+    """Return the displacement below which nothing is marked; the colour scale always covers it."""
     return LEAST_SCALE * float(np.ptp(mesh.rest_vertices, 0).max())
 
 
@@ -240,7 +241,7 @@ def _title(frame: dict[str, np.ndarray], mesh: Mesh, name: str) -> str:
 
 
 def _failure(frame: dict[str, np.ndarray]) -> str:
-    """Why a frame has no surface, beside its headline."""
+    """Return the reason why a frame has no surface, for its headline."""
     _, _, remedy = Status(int(frame["status"])).text.removesuffix("; no surface").partition(": ")
     found = np.atleast_2d(frame["confidence"] > 0).any(0)
     count = f"{found.sum()} of {found.size} markers found"
@@ -248,7 +249,7 @@ def _failure(frame: dict[str, np.ndarray]) -> str:
 
 
 def _annotate(axes: Axes, text: str, place: np.ndarray, size: np.ndarray) -> None:
-    """A label beside a point, on the side where the image has more room."""
+    """Write a label beside a point, on the side where the image has more room."""
     side, up = (-1 if place[0] > size[0] / 2 else 1), (1 if place[1] > size[1] / 2 else -1)
     axes.annotate(
         text,
@@ -265,19 +266,19 @@ def _annotate(axes: Axes, text: str, place: np.ndarray, size: np.ndarray) -> Non
 
 
 def _magnification(flow: np.ndarray, width: float) -> int:
-    """How much longer arrows may be drawn so that the longest stay under `LONGEST_ARROW` of the image's width."""
+    """Return the factor by which arrows can be magnified while the longest stay under `LONGEST_ARROW` of the image's width."""
     longest = np.percentile(np.linalg.norm(flow, axis=1), 99) if len(flow) else 0.0
     return max((times for times in MAGNIFICATIONS if times * longest <= LONGEST_ARROW * width), default=1)
 
 
 def _thinned(pixels: np.ndarray, pitch: float) -> np.ndarray:
-    """Which of the points to draw, `[D]`: the first one in every cell of `pitch`, or all if few would be left out."""
+    """Return which points to draw, `[D]`: the first one in each cell of `pitch`, or all if few would be omitted."""
     first = np.zeros(len(pixels), bool)
     first[np.unique(pixels // pitch, axis=0, return_index=True)[1]] = True
     return first if first.sum() < 0.6 * len(pixels) else np.ones(len(pixels), bool)
 
 
 def _side_axis(X: np.ndarray, vertex: int) -> int:
-    """0 to look at x and z, 1 for y and z: where the vertex is farther from the middle."""
+    """Return 0 for a view of x and z, 1 for y and z: the axis along which the vertex is farther from the middle."""
     middle = (X.max(0) + X.min(0)) / 2
     return int(np.abs(X[vertex] - middle)[:2].argmax())

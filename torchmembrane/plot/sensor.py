@@ -96,14 +96,14 @@ def _draw_rays(axes: Axes, sensor: Sensor, X: np.ndarray) -> None:
 
 
 def _leaves_port(camera: Camera, points: np.ndarray, depth: float) -> np.ndarray:
-    """Where the rays to points `[N, 3]` cross the plane `z = depth`."""
+    """Return where the rays to points `[N, 3]` cross the plane `z = depth`."""
     with torch.no_grad():
         origin, direction = (a.numpy() for a in camera.pixel_to_ray(camera.point_to_pixel(torch.from_numpy(points))))
     return origin + direction * ((depth - origin[:, 2:]) / direction[:, 2:])
 
 
 def _draw_space(axes: Any, X: np.ndarray, grid: tuple[int, int], markers: np.ndarray | None, unit: str) -> None:
-    """The rest surface and its markers `[D, 3]` on three-dimensional axes."""
+    """Draw the rest surface and its markers `[D, 3]` on three-dimensional axes."""
     axes.plot_wireframe(*X.T.reshape(3, *grid), color=BLUE, lw=0.5, rcount=LINES + 1, ccount=LINES + 1)
     title = "Rest surface"
     if markers is not None:
@@ -121,14 +121,14 @@ def _draw_space(axes: Any, X: np.ndarray, grid: tuple[int, int], markers: np.nda
 
 
 def _found(reconstructor: "Reconstructor", frame: dict[str, np.ndarray], view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where a view's markers are in its rest image, `[D, 2]`, and which of them are found, `[D]` bool."""
+    """Return the pixels of a view's markers in its rest image, `[D, 2]`, and which of them are found, `[D]` bool."""
     observer = reconstructor.observer
     place = observer.by_view(observer.measured_rest[None]).reshape(-1, *reconstructor.rest_markers.shape[:1], 2)
     return place[view].cpu().numpy(), frame["confidence"].reshape(len(place), -1)[view] > 0
 
 
 def _draw_projection(axes: Axes, sensor: Sensor, view: int, markers: tuple[np.ndarray, np.ndarray] | None) -> None:
-    """A view's rest image, with the grid, and its markers as `_found` gives them."""
+    """Draw a view's rest image with the grid and its markers as returned by `_found`."""
     name, sensor = sensor.views[view].name if sensor.views else "", sensor.in_view(view)
     grid, image = sensor.membrane.grid, sensor.markers.rest_image
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Force, moment and pressure of recordings over time, with intervals and statuses: `view DIR --plot`."""
+"""Force, moment and pressure of recordings over time, with uncertainties and statuses: `view DIR --plot`."""
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -13,7 +13,7 @@ from ..results.status import Status
 from ..results.summary import UNREADABLE
 from .drawing import BLUE, GREY, VERMILION, readable
 
-GREEN = "#009E73"  # distinct from the others with any colour vision
+GREEN = "#009E73"  # distinguishable from the others with any colour vision
 COLOURS = dict(zip("xyz", (VERMILION, GREEN, BLUE), strict=True))
 SHADES = ("#F0E442", "#CC79A7", "#56B4E9", "#E69F00", "#999999", "#8C564B")
 """Colours of the bands of statuses other than ok, in the order in which they appear."""
@@ -27,13 +27,13 @@ ABOVE, BELOW, LEFT, GAP = 0.75, 1.35, 1.05, 0.35
 
 @readable
 def series_figure(runs: Mapping[str, Sequence[Mapping[str, str]]]) -> Figure:
-    """Rows of force, moment and pressure change, a column for each recording, with the same scales.
+    """Draw rows of force, moment and pressure change with a column for each recording, all on the same scales.
 
-    Shaded beside a component of the force is one standard deviation; the background's colour is the frame's status where it is
-    not ok. A frame without an answer leaves a gap.
+    The shaded band of a force component is one standard deviation. The background colour shows the status of frames that are
+    not ok. A frame without a result leaves a gap.
 
     Args:
-        runs: rows of `summary.csv` by the recordings' names.
+        runs: rows of `summary.csv`, by the names of the recordings.
 
     Example:
         >>> from torchmembrane.results.summary_row import NAMES
@@ -66,7 +66,7 @@ def series_figure(runs: Mapping[str, Sequence[Mapping[str, str]]]) -> Figure:
 
 
 def _rows(rows: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
-    """What is drawn, and its unit."""
+    """Return the columns to be drawn, with their units."""
     length, force = rows[0]["length_unit"], rows[0]["force_unit"]
     pressure = ("pressure change", "hPa") if force == "N" else ("pressure change", f"{force}/{length}²")
     return [("force", force), ("moment", f"{force} {length}"), pressure]
@@ -93,7 +93,7 @@ def _draw(axes: Axes, times: np.ndarray, rows: Sequence[Mapping[str, str]], what
 
 
 def _line(axes: Axes, times: np.ndarray, values: np.ndarray, **style) -> None:
-    """A line, with a point for each frame without a neighbour."""
+    """Draw a line, with a point for each frame without a neighbour."""
     known = np.isfinite(values)
     alone = known & ~np.append(False, known[:-1]) & ~np.append(known[1:], False)
     axes.plot(times, values, **style)
@@ -101,7 +101,7 @@ def _line(axes: Axes, times: np.ndarray, values: np.ndarray, **style) -> None:
 
 
 def _shade(axes: Axes, times: np.ndarray, rows: Sequence[Mapping[str, str]], shades: dict[int, str]) -> None:
-    """Bands of the statuses that are not ok, from halfway to the frame before to halfway to the next."""
+    """Shade frames whose status is not ok, from halfway to the preceding frame to halfway to the next."""
     statuses = np.array([int(row["status"]) for row in rows])
     middles = (times[1:] + times[:-1]) / 2
     before = (2 * times[0] - middles[0], 2 * times[-1] - middles[-1]) if len(middles) else (times[0] - 0.5, times[0] + 0.5)
@@ -123,7 +123,7 @@ def _times(rows: Sequence[Mapping[str, str]]) -> tuple[np.ndarray, str]:
 
 
 def _since(time: float) -> str:
-    """When a recording began; nothing where its times are since its own beginning.
+    """Return the text of a recording's start, empty if its times count from its own beginning.
 
     Example:
         >>> _since(1790509109.25), _since(3.0)

@@ -24,11 +24,11 @@ LEVELS, LETTERS = 21, 22
 
 
 def sheet_figure(frames: Mapping[str, tuple[Frame, np.ndarray | None]], mesh: Mesh) -> Figure:
-    """Displacement along the rest normals of frames by name, all in the same colours, with force and status.
+    """Draw the displacement along the rest normals of all frames on one colour scale, with force and status.
 
     Args:
-        frames: arrays of each, and its image `[height, width]` in 0..1, which is drawn where there is no surface.
-        mesh: what they share.
+        frames: arrays of each frame, and its image `[height, width]` in 0..1, which is drawn if there is no surface.
+        mesh: the data that the frames share.
     """
     across = min(ACROSS, len(frames))
     down, (image_width, image_height) = ceil(len(frames) / across), mesh.image_size.tolist()
@@ -60,7 +60,7 @@ def sheet_figure(frames: Mapping[str, tuple[Frame, np.ndarray | None]], mesh: Me
 def _draw(
     axes: Axes, frame: Frame, depth: np.ndarray, mesh: Mesh, image: np.ndarray | None, limit: float
 ) -> TriContourSet | None:
-    """One frame's map, or its image; returns the map's shades."""
+    """Draw one frame's map, or its image; return the filled contours of the map."""
     width, height = mesh.image_size
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     if not np.isfinite(depth).all():
@@ -81,7 +81,7 @@ def _draw(
 
 
 def _name(axes: Axes, name: str, frame: Frame, unit: str, digits: int) -> None:
-    """Name, force with so many digits after the point, and the status where it is not ok."""
+    """Write the name, the force with `digits` decimals, and the status if it is not ok."""
     status = Status(int(frame["status"]))
     force = float(np.linalg.norm(frame["force"]))
     said = f"{force:.{digits}f} {unit if unit == 'N' else ''}".rstrip() if np.isfinite(force) else "no surface"

@@ -1,4 +1,4 @@
-"""A sensor in silico: presses on its membrane, on a grid finer than its solver's, their images and the truth about them."""
+"""Simulation of a sensor: presses on its membrane, on a grid finer than its solver's, their images, and the ground truth."""
 
 import json
 import math
@@ -23,19 +23,19 @@ from .quasi_static import Press, presses
 from .render import RenderedDots, Renderer
 
 LEGS = ("push", "slide", "release")
-REST_NOISE = 2**31 - 1  # its seed, unlike those of frames
+REST_NOISE = 2**31 - 1  # seed of the rest image's noise, different from those of frames
 BEHIND = "the press takes the membrane behind the camera"
-LIFT = 0.05  # above the first touch, over the surface's size, where a release ends
+LIFT = 0.05  # height above the first contact where a release ends, over the surface's size
 
 
 class Stroke(NamedTuple):
-    """One indenter's motion from its first touch, lengths in the sensor's unit.
+    """The motion of one indenter from its first contact, lengths in the sensor's unit.
 
     Attributes:
-        indenter: where it first touches.
-        travel: `[3]`, unit vector along which it presses.
-        depth: how far.
-        slide: `[3]`, how it moves then.
+        indenter: the indenter at its first contact.
+        travel: unit vector of the press, `[3]`.
+        depth: distance of the press.
+        slide: displacement after the press, `[3]`.
         friction: Coulomb's coefficient.
 
     Example:
@@ -52,7 +52,8 @@ class Stroke(NamedTuple):
     friction: float = 0.0
 
     def poses(self, legs: Sequence[str], frames: int, lift: float) -> list[Indenter]:
-        """`frames` evenly spaced poses on each of the `legs`, "push", "slide", "release"; the release ends `lift` above."""
+        """Return `frames` equidistant poses on each of the `legs`, "push", "slide", "release"; the release ends `lift`
+        above."""
         offsets: list[np.ndarray] = []
         here = np.zeros(3)
         motion = {"push": self.depth * self.travel, "slide": self.slide, "release": -(self.depth + lift) * self.travel}
@@ -62,7 +63,7 @@ class Stroke(NamedTuple):
         return [self.indenter.moved(offset) for offset in offsets]
 
     def described(self) -> dict[str, Any]:
-        """The stroke as a frame's truth keeps it."""
+        """Return the description of the stroke that a frame's truth stores."""
         sizes = {
             key: np.asarray(value).tolist()
             for key, value in vars(self.indenter).items()
@@ -81,12 +82,12 @@ class Stroke(NamedTuple):
 
 
 class SimulatedFrame(NamedTuple):
-    """An image with what is true in it.
+    """An image with its ground truth.
 
     Attributes:
-        image: `[H, W]` uint8; of several views the first one's, or the one whose regions they are.
-        truth: arrays by the names of `Simulator.frame`.
-        further: images of the further views that have images of their own.
+        image: `[H, W]` uint8; with several views the first one's, or the image whose regions they are.
+        truth: arrays by name, see `Simulator.frame`.
+        further: images of the other views, if views have separate images.
     """
 
     image: np.ndarray
@@ -96,16 +97,17 @@ class SimulatedFrame(NamedTuple):
 
 @check_arguments
 class Simulator:
-    """Presses and images of one sensor.
+    """Simulates presses and images of one sensor.
 
-    A gas without modulus acts as a liquid.
+    A gas without a modulus is treated as a liquid.
 
     Args:
         sensor: the sensor.
-        grid: grid of the equilibrium; default: about 38 per side, finer than the solver's, no line in common but the rim.
-        appearance: light, lens and chip.
+        grid: grid of the equilibrium; default: about 38 per side, finer than the solver's and sharing no line with it but the
+            rim.
+        appearance: lighting, lens and image sensor.
         radii: radii of small and large dots, length unit; default: as in `Dots.from_sensor`.
-        missing: dots that are not painted.
+        missing: indices of dots that are not painted.
 
     Raises:
         MembraneError: the grid is not finer than the sensor's own.
@@ -144,24 +146,24 @@ class Simulator:
         self.rest_dots = self.dots(self.membrane.rest)
 
     def image(self, vertices: torch.Tensor, rng: np.random.Generator) -> np.ndarray:
-        """The membrane at `vertices [V, 3]` as the chip delivers it, uint8 `[H, W]`; `rng` makes the noise. Of several views
-        the first one's, or the one whose regions they are."""
+        """Return the image of the membrane at `vertices [V, 3]`, uint8 `[H, W]`; `rng` generates the noise. With several views,
+        it is the first one's, or the image whose regions they are."""
         return self.images(vertices, rng)[0]
 
     def images(self, vertices: torch.Tensor, rng: np.random.Generator) -> list[np.ndarray]:
-        """The same of all views that have images of their own; of regions the image that they share."""
+        """Return the images of all views that have separate images; if views are regions, the image that they share."""
         views = self.view_images(vertices, rng)
         shared = shared_image(views, self.sensor.views) if self.sensor.views else None
         return views if shared is None else [shared]
 
     def view_images(self, vertices: torch.Tensor, rng: np.random.Generator) -> list[np.ndarray]:
-        """What each view sees, uint8 `[H, W]`."""
+        """Return the image of each view, uint8 `[H, W]`."""
         with torch.no_grad():
             clean = [renderer(x) for renderer, x in zip(self.renderers, self._in_views(vertices), strict=True)]
             return [(255 * noisy(image, self.appearance.noise, rng)).round().byte().cpu().numpy() for image in clean]
 
     def dots(self, vertices: torch.Tensor) -> RenderedDots:
-        """The pattern's dots on the membrane at `vertices [V, 3]`; of several views pixels `[W, D, 2]` and which are visible
+        """Return the pattern's dots on the membrane at `vertices [V, 3]`; with several views, pixels `[W, D, 2]` and visibility
         `[W, D]` in each."""
         each = [renderer.dots(x) for renderer, x in zip(self.renderers, self._in_views(vertices), strict=True)]
         if len(each) == 1:
@@ -171,36 +173,36 @@ class Simulator:
         )
 
     def _in_views(self, vertices: torch.Tensor) -> list[torch.Tensor]:
-        """The vertices in the views' frames."""
+        """Return the vertices in the frame of each view."""
         return [vertices, *(view.pose.inverse.points(vertices) for view in self.sensor.views[1:])]
 
     def rest_image(self) -> np.ndarray:
-        """The image at rest, float32 `[H, W]`, as a sensor keeps it; of several views the first one's."""
+        """Return the image at rest, float32 `[H, W]`, as a sensor stores it; with several views, the first one's."""
         return to_grey(self.view_images(self.membrane.rest, np.random.default_rng(REST_NOISE))[0])
 
     def at_rest(self) -> Sensor:
-        """The sensor with the rest images that this simulator makes."""
+        """Return the sensor with rest images rendered by this simulator."""
         sensor = self.sensor
         images = [to_grey(image) for image in self.view_images(self.membrane.rest, np.random.default_rng(REST_NOISE))]
         views = tuple(replace(view, rest_image=image) for view, image in zip(sensor.views, images, strict=False))
         return replace(sensor, markers=replace(sensor.markers, rest_image=images[0]), views=views)
 
     def presses(self, stroke: Stroke, legs: Sequence[str], frames: int = 1, increment: float | None = None) -> Iterator[Press]:
-        """Equilibria along a stroke.
+        """Compute the equilibria along a stroke.
 
-        The motion starts at the first touch, which is no frame: with friction the force depends on the path from there.
+        The motion starts at the first contact, which is not a frame: with friction the force depends on the path from there.
 
         Args:
-            stroke: the motion.
+            stroke: the motion of the indenter.
             legs: legs of the stroke, some of "push", "slide", "release".
-            frames: on each leg.
-            increment: longest travel in one step; default: as of `presses`.
+            frames: number of frames on each leg.
+            increment: longest travel in one step; default: that of `presses`.
 
         Yields:
             The equilibrium at each frame.
 
         Raises:
-            MembraneError: the indenter never touches, or the membrane cannot follow.
+            MembraneError: the indenter never touches the membrane, or the membrane cannot follow it.
         """
         poses = [stroke.indenter, *stroke.poses(legs, frames, LIFT * self.membrane.size)]
         states = presses(self.membrane, self.elasticity, [poses], friction=stroke.friction, increment=increment, **self.cavity)
@@ -214,11 +216,12 @@ class Simulator:
             raise MembraneError("simulate: the indenter never touches the membrane; expected a depth that presses it in")
 
     def leaves_camera(self, vertices: torch.Tensor) -> bool:
-        """Whether the membrane is no more before its camera: vertices are where the lens images nothing, or it has passed the
-        centre of projection, so that the solid angle that it takes there, which the rim fixes, is another one.
+        """Return whether the membrane is no longer in front of its camera: the lens does not image some vertices, or the
+        membrane has passed the centre of projection, which changes the solid angle that it subtends there (otherwise fixed by
+        the rim).
 
         Args:
-            vertices: on the grid, `[V, 3]`.
+            vertices: vertices on the grid, `[V, 3]`.
         """
         camera, membrane = self.sensor.camera, self.membrane
         lost = camera.can_image(membrane.rest) & ~camera.can_image(vertices)
@@ -226,7 +229,7 @@ class Simulator:
         return bool(lost.any()) or abs(angles[1] - angles[0]) > 2 * math.pi
 
     def frame(self, state: Press, stroke: Stroke, rng: np.random.Generator) -> SimulatedFrame:
-        """The image of an equilibrium and its truth.
+        """Render the image of an equilibrium and return it with its ground truth.
 
         Args:
             state: the equilibrium.
@@ -267,12 +270,12 @@ class Simulator:
 
 
 def solid_angle(corners: torch.Tensor) -> float:
-    """The solid angle of triangles as seen from the origin, positive where they turn their outer sides away from it.
+    """Return the solid angle of triangles seen from the origin, positive if their outer sides face away from it.
 
     With a, b, c a triangle's corners, `tan(W / 2) = det(a b c) / (|a||b||c| + a.b |c| + b.c |a| + c.a |b|)`.
 
     Args:
-        corners: `[T, 3, 3]`.
+        corners: corners of the triangles, `[T, 3, 3]`.
 
     Returns:
         The sum over the triangles, sr.
@@ -288,7 +291,7 @@ def solid_angle(corners: torch.Tensor) -> float:
 
 
 def _finer(count: int) -> int:
-    """Lines of the equilibrium's grid, evenly spaced as the solver's `count`, none in common but the first and the last."""
+    """Return a number of grid lines, equidistant as the solver's `count`, that share only the first and the last with it."""
     finer = min(2 * count + 3, max(38, count + 4))
     while gcd(count - 1, finer - 1) > 1:
         finer += 1

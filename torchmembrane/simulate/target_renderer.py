@@ -1,4 +1,4 @@
-"""Images of a flat calibration target, also through ports: every sample's ray is followed to the plane. Light is even."""
+"""Rendering of flat calibration targets, also through ports: each sample's ray is traced to the plane. Light is uniform."""
 
 from typing import NamedTuple
 
@@ -10,16 +10,16 @@ from ..camera.model import Camera
 from ..camera.targets import Checkerboard, DotBoard
 from .appearance import blurred, noisy
 
-SAMPLES = 4  # along a pixel's side
-GROUND = 0.4  # reflectance of what is not the board
+SAMPLES = 4  # number of samples along a pixel's side
+GROUND = 0.4  # reflectance outside the board
 
 
 class TargetRenderer(NamedTuple):
-    """One camera's images of flat targets.
+    """Renders one camera's images of flat targets.
 
     Attributes:
-        origin: origin of the rays through all samples of the image, `[H s, W s, 3]`.
-        direction: theirs, `[H s, W s, 3]`.
+        origin: origins of the rays through all samples of the image, `[H s, W s, 3]`.
+        direction: directions of these rays, `[H s, W s, 3]`.
 
     Example:
         >>> renderer = TargetRenderer.for_camera(Camera("pinhole", (32, 24), (30.0, 30.0), (15.5, 11.5)))
@@ -33,7 +33,7 @@ class TargetRenderer(NamedTuple):
 
     @classmethod
     def for_camera(cls, camera: Camera) -> "TargetRenderer":
-        """The renderer of a camera, with or without ports."""
+        """Return the renderer of a camera, with or without ports."""
         width, height = camera.image_size
         u, v = ((np.arange(side * SAMPLES) + 0.5) / SAMPLES - 0.5 for side in (width, height))
         pixels = torch.from_numpy(np.stack(np.meshgrid(u, v), -1))
@@ -48,18 +48,18 @@ class TargetRenderer(NamedTuple):
         blur: float = 0.6,
         rng: np.random.Generator | None = None,
     ) -> np.ndarray:
-        """The board with its point X at `rotation X + translation` in the camera's frame.
+        """Render the board with its point X at `rotation X + translation` in the camera's frame.
 
         Args:
             board: the target.
-            rotation: `[3, 3]`.
-            translation: `[3]`, length unit.
-            noise: white over its standard deviation, dB; None: no noise.
+            rotation: rotation of the board, `[3, 3]`.
+            translation: position of the board's origin, `[3]`, length unit.
+            noise: ratio of white to the noise's standard deviation, dB; None: no noise.
             blur: standard deviation of the defocus, px.
             rng: random generator of the noise.
 
         Returns:
-            The image in grey, uint8 `[H, W]`.
+            The grey image, uint8 `[H, W]`.
         """
         rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
         origin, direction = (self.origin - translation) @ rotation, self.direction @ rotation
