@@ -1,4 +1,4 @@
-"""Markers located by soft-argmax of responses, built of kornia's operators: piecewise differentiable."""
+"""Markers located by soft-argmax of filter responses, with kornia's operators: piecewise differentiable."""
 
 from .locator import SoftLocator
 from .texture import SoftTextureLocator

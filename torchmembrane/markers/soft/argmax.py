@@ -1,4 +1,4 @@
-"""Soft-argmax of a response in windows about where markers are predicted."""
+"""Soft-argmax of a response in windows around the predicted markers."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,12 @@ from torch import Tensor
 
 
 class Peak(NamedTuple):
-    """What a soft-argmax finds in windows.
+    """The result of a soft-argmax in windows.
 
     Attributes:
-        place: of the peak `[B, D, 2]`, px.
-        strength: the response there `[B, D]`, averaged with the weights of the soft-argmax.
-        spread: standard deviation of the place `[B, D]` over those weights, px: wide where there are several peaks.
+        place: position of the peak, `[B, D, 2]`, px.
+        strength: mean response with the weights of the soft-argmax, `[B, D]`.
+        spread: standard deviation of the position with these weights, `[B, D]`, px: large if there are several peaks.
     """
 
     place: Tensor
@@ -24,18 +24,18 @@ class Peak(NamedTuple):
 def window_peak(
     score: Tensor, value: Tensor, middle: Tensor, stride: Tensor, predicted: Tensor, reach: Tensor, temperature: float
 ) -> Peak:
-    """The expected place of a marker in its window.
+    """Return the expected position of a marker in its window.
 
     `E[x]` under the weights `exp(score / temperature - |x - predicted|^2 / 2 reach^2)`.
 
     Args:
-        score: `[B, D, n, n]`, what the soft-argmax is of.
-        value: `[B, D, n, n]`, what `strength` is of.
-        middle: of the windows `[B, D, 2]`, px.
-        stride: between their pixels `[D]`, px.
-        predicted: `[B, D, 2]`, px.
-        reach: standard deviation of the predictions `[D]`, px.
-        temperature: of the softmax, in units of the score.
+        score: score whose soft-argmax is computed, `[B, D, n, n]`.
+        value: response that is averaged to `strength`, `[B, D, n, n]`.
+        middle: centres of the windows, `[B, D, 2]`, px.
+        stride: distance between their pixels, `[D]`, px.
+        predicted: predicted positions, `[B, D, 2]`, px.
+        reach: standard deviations of the predictions, `[D]`, px.
+        temperature: temperature of the softmax, in units of the score.
 
     Example:
         >>> step = torch.arange(-4.0, 5.0)

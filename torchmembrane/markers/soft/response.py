@@ -1,4 +1,4 @@
-"""How strongly an image looks like a dot, each at its own scale: differences of Gaussians on a pyramid."""
+"""Similarity of an image to dots, each at its own scale: differences of Gaussians on a pyramid."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,7 +27,7 @@ class Windows(NamedTuple):
 
 
 def disc_response(radius: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """`sigma^2` times the Laplacian of Gaussian at the centre of a disc, of contrast 1.
+    """Return `sigma^2` times the Laplacian of Gaussian at the centre of a disc of contrast 1.
 
     Example:
         >>> bool(np.isclose(disc_response(np.array(3.0), np.array(3 / 2**0.5)), DISC_RESPONSE))
@@ -38,7 +38,7 @@ def disc_response(radius: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def pyramid(image: Tensor) -> list[Tensor]:
-    """The image and `LEVELS` - 1 halvings of it, each low-passed before: pixel `p` of level `k` is at `2^k p` of the image.
+    """Return the image and `LEVELS` - 1 low-passed halvings of it: pixel `p` of level `k` is at `2^k p` of the image.
 
     Example:
         >>> [list(level.shape) for level in pyramid(torch.zeros(1, 1, 64, 80))][2:]
@@ -51,17 +51,17 @@ def pyramid(image: Tensor) -> list[Tensor]:
 
 
 class DotResponse(nn.Module):
-    """Difference of Gaussians at every dot's own scale, less that of the other size.
+    """Difference of Gaussians at each dot's own scale, minus the response of the other dot size.
 
     The scale is `radius / 2^0.5`, where the response to a disc is largest. A pattern of two sizes has two scales about each
     place: of the other size's response as much is taken off as makes this one vanish at its dots.
 
-    Args:
-        radii: of the dots `[D]`, px.
+    radii: radii of the dots, `[D]`, px.
+        others: radii of dots of the other size at the same places, `[D]`, px; NaN if there is one size only.
         others: radii that dots of the other size have there `[D]`, px; NaN where there is one size only.
-        coarser: how many levels of the pyramid above the coarsest that still shows a dot's shape (negative: below).
-        reach: half side of the windows `[D]`, px.
-        inside: `[1, 1, H, W]`, 1 where the membrane is, else 0: what is not has zero weight in the Gaussians.
+        coarser: number of pyramid levels above the coarsest that still shows a dot's shape (negative: below).
+        reach: half side of the windows, `[D]`, px.
+        inside: `[1, 1, H, W]`, 1 on the membrane, else 0: pixels outside have zero weight in the Gaussians.
     """
 
     order: Tensor
@@ -86,7 +86,8 @@ class DotResponse(nn.Module):
         self.register_buffer("share", torch.as_tensor(np.where(np.isfinite(others), share, 0.0)))
 
     def _register_level(self, k: int, dots: np.ndarray, sigma: np.ndarray, other: np.ndarray, mask: Tensor) -> None:
-        """Which dots have their response on level `k`, in which of its maps, and where in them a window's pixels are."""
+        """Register which dots have their response on level `k`, in which of its maps, and where their windows' pixels are in
+        them."""
         own, its_other = (np.round(np.log(s[dots]) / np.log(SIGMA_RATIO)).astype(int) for s in (sigma, other))
         self.rungs[k] = sorted({*own.tolist(), *its_other.tolist()})
         height, width = mask.shape[-2:]
@@ -101,22 +102,22 @@ class DotResponse(nn.Module):
 
     @traced
     def maps(self, levels: list[Tensor]) -> list[Tensor]:
-        """Responses to dark discs on each level in use, one map for each scale: `[B, scales, h, w]`.
+        """Return the responses to dark discs on each level in use, one map for each scale: `[B, scales, h, w]`.
 
         Args:
-            levels: of the pyramid of an image that is zero where the membrane is not.
+            levels: pyramid of an image that is zero outside the membrane.
         """
         return [self._dark_blobs(k, levels[k]) for k in self.levels]
 
     def _dark_blobs(self, k: int, level: Tensor) -> Tensor:
-        """Differences of the means over Gaussians two rungs apart, on level `k [B, 1, h, w]`: positive where it is dark."""
+        """Return differences of the means over Gaussians two rungs apart on level `k [B, 1, h, w]`: positive on dark blobs."""
         rungs = self.rungs[k]
         mean, at = gaussians(level, rungs) * self.get_buffer(f"covered{k}"), _with_neighbours(rungs)
         above, below = ([at.index(rung + side) for rung in rungs] for side in (1, -1))
         return (mean[:, above] - mean[:, below]) * self.get_buffer(f"mask{k}")
 
     def windows(self, maps: Sequence[Tensor], centre: Tensor) -> Windows:
-        """Each dot's response about `centre [B, D, 2]` px; near the border a window stops where it meets the border."""
+        """Return each dot's response around `centre [B, D, 2]` px; near the border, windows are clipped."""
         values, middles = [], []
         for k, each in zip(self.levels, maps, strict=True):
             near = centre.detach().index_select(1, self.get_buffer(f"dots{k}")) / 2**k
@@ -134,12 +135,13 @@ class DotResponse(nn.Module):
 
 
 def gaussians(image: Tensor, rungs: list[int]) -> Tensor:
-    """Blurred images `[B, scales, h, w]` of `image [B, 1, h, w]`: by `SIGMA_RATIO ** rung`, of the neighbours of `rungs`."""
+    """Return blurred images `[B, scales, h, w]` of `image [B, 1, h, w]`, by `SIGMA_RATIO ** rung` for the neighbours of
+    `rungs`."""
     return torch.cat([_blurred(image, SIGMA_RATIO**rung) for rung in _with_neighbours(rungs)], 1)
 
 
 def _with_neighbours(rungs: list[int]) -> list[int]:
-    """`rungs` and those beside them.
+    """Return `rungs` and their neighbours.
 
     >>> _with_neighbours([1, 3])
     [0, 2, 4]

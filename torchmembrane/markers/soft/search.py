@@ -1,4 +1,4 @@
-"""Dots searched for by soft-argmax about their predictions, and grown inwards from the rim."""
+"""Search for dots by soft-argmax around their predictions, ring by ring inwards from the rim."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,7 +26,7 @@ LEAST_GROWTH_RESPONSE = 0.05  # of a drawn dot's response, of a peak that is hal
 
 
 class Found(NamedTuple):
-    """Dots as found: `place [B, D, 2]` px, `response [B, D]` over a drawn dot's, `sharpness [B, D]` of the peak in 0..1."""
+    """The dots found: `place [B, D, 2]` px, `response [B, D]` over a drawn dot's, `sharpness [B, D]` of the peak in 0..1."""
 
     place: Tensor
     response: Tensor
@@ -34,17 +34,17 @@ class Found(NamedTuple):
 
 
 class DotSearch(nn.Module):
-    """Soft-argmax of the dots' responses in windows about where they are predicted, on one level of the pyramid each.
+    """Soft-argmax of the dots' responses in windows around their predictions, each on one level of the pyramid.
 
     Args:
-        radii: of the dots `[D]`, px.
-        others: radii that dots of the other size have there `[D]`, px, or NaN.
+        radii: radii of the dots, `[D]`, px.
+        others: radii of dots of the other size at the same places, `[D]`, px, or NaN.
         coarser: level of the pyramid, as in `DotResponse`.
-        error: standard deviation of the predictions `[D]`, px.
-        inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
+        error: standard deviations of the predictions, `[D]`, px.
+        inside: `[1, 1, H, W]`, 1 on the membrane, else 0.
 
     Attributes:
-        response: the responses, and windows of them.
+        response: the filter that computes the responses and their windows.
     """
 
     error: Tensor
@@ -60,14 +60,15 @@ class DotSearch(nn.Module):
         self.register_buffer("spread", torch.ones(len(radii), dtype=torch.float64))
 
     def calibrate(self, levels: list[Tensor], pixels: Tensor) -> None:
-        """Take a drawn pattern's responses, levels of its image, as those of sure dots `pixels [D, 2]`."""
+        """Use the responses to a drawn pattern, given by the levels of its image, as those of certain dots at
+        `pixels [D, 2]`."""
         for _ in range(2):  # the floor is relative to the strength
             peak = self._peak(self.response.maps(levels), pixels[None])
             self.strength, self.spread = peak.strength[0].clamp_min(1e-3), peak.spread[0]
 
     @traced
     def forward(self, maps: Sequence[Tensor], predicted: Tensor) -> Found:
-        """The dots about `predicted [B, D, 2]` px, from the responses on each level."""
+        """Return the dots around `predicted [B, D, 2]` px, from the responses on each level."""
         peak = self._peak(maps, predicted)
         sharpness = torch.sigmoid(4 * (LARGEST_RELATIVE_SPREAD - peak.spread / self.spread))
         return Found(peak.place, (peak.strength / self.strength).relu(), sharpness)
@@ -79,17 +80,17 @@ class DotSearch(nn.Module):
 
 
 class DotGrowth(nn.Module):
-    """Dots of one size found one ring after another from the rim inwards, along the smooth flow.
+    """Finds dots of one size ring by ring from the rim inwards, along the smooth flow.
 
-    Each step predicts every dot from the sure ones around it (locally affine, the rim at rest) and looks for it there.
-    Without anchors all are predicted at rest to begin with.
+    Each step predicts every dot from the certain ones around it (locally affine, with the rim at rest) and searches for it
+    there. Without anchors, all dots are predicted at rest at first.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
-        radii: `[D]`, px.
-        others: radii that dots of the other size have there `[D]`, px, or NaN.
-        anchors: pixels `[A, 2]` on the rim, where nothing moves; none at all is `[0, 2]`.
-        inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
+        radii: radii of the dots, `[D]`, px.
+        others: radii of dots of the other size at the same places, `[D]`, px, or NaN.
+        anchors: fixed pixels on the rim, `[A, 2]`; `[0, 2]` if there are none.
+        inside: `[1, 1, H, W]`, 1 on the membrane, else 0.
     """
 
     pixels: Tensor
@@ -110,8 +111,8 @@ class DotGrowth(nn.Module):
         """Find the dots.
 
         Args:
-            levels: of the image's pyramid, dots dark.
-            previous: pixels `[B, D, 2]` in the frames before, NaN where lost, to start from.
+            levels: pyramid of the image, with dark dots.
+            previous: pixels `[B, D, 2]` in the preceding frames, NaN where lost, from which the search starts.
 
         Returns:
             Pixels `[B, D, 2]` and weight `[B, D]` in 0..1.
@@ -122,7 +123,7 @@ class DotGrowth(nn.Module):
 
     @traced
     def begin(self, levels: list[Tensor], previous: Tensor | None = None) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-        """The responses on each level, and before the first step weight, flow and its gradient, as `step` has them."""
+        """Return the responses on each level, and the initial weight, flow and flow gradient for `step`."""
         maps, batch = self.search.response.maps(levels), levels[0].shape[0]
         weight = self.known.repeat(batch, 1)
         flow = torch.zeros_like(self.pixels).repeat(batch, 1, 1)
@@ -134,7 +135,7 @@ class DotGrowth(nn.Module):
 
     @traced
     def step(self, weight: Tensor, flow: Tensor, gradient: Tensor, *maps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One step of the growth: weight `[B, D]`, flow `[B, D, 2]` and its gradient `[B, D, 2, 2]` after it."""
+        """Perform one growth step; return the new weight `[B, D]`, flow `[B, D, 2]` and flow gradient `[B, D, 2, 2]`."""
         predicted, gradient, support = predict(self.averages, weight, flow, gradient)
         found = self.search(maps, self.pixels + predicted)
         believed = torch.sigmoid(10 * (support - LEAST_SUPPORT)) * found.response / (found.response + LEAST_GROWTH_RESPONSE)
@@ -142,16 +143,16 @@ class DotGrowth(nn.Module):
 
     @traced
     def moved(self, flow: Tensor) -> Tensor:
-        """Pixels `[B, D, 2]` of the dots after that flow."""
+        """Return the pixels `[B, D, 2]` of the dots displaced by a flow."""
         return self.pixels + flow
 
 
 def rings(kernel: np.ndarray, weight: np.ndarray) -> int:
-    """How many steps it takes the growth from the nodes of `weight [N]` 1 to reach every dot it can reach.
+    """Return the number of steps in which the growth reaches all reachable dots from the nodes of `weight [N]` 1.
 
     Args:
-        kernel: weights `[N, D]` of the averages over the nodes, of which the dots are the first.
-        weight: 0 or 1.
+        kernel: weights `[N, D]` of the averages over the nodes, the first of which are the dots.
+        weight: weights of the nodes, 0 or 1, `[N]`.
 
     Example:
         >>> rings(np.eye(5, k=1) * 2, np.array([1.0, 0.0, 0.0, 0.0, 0.0]))
@@ -166,16 +167,16 @@ def rings(kernel: np.ndarray, weight: np.ndarray) -> int:
 
 
 def predict(averages: FlowAverages, weight: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The flow that the sure dots around each predict, by a weighted affine least-squares fit in closed form.
+    """Return the flow that the certain dots around each dot predict, by a weighted affine least-squares fit in closed form.
 
     Args:
-        averages: over the dots and anchors.
+        averages: averages over the dots and anchors.
         weight: `[B, D]` in 0..1.
         flow: `[B, D, 2]`, px.
         gradient: `[B, D, 2, 2]`, to which the fit is drawn where the dots around do not fix it.
 
     Returns:
-        Flow `[B, D, 2]` px, gradient `[B, D, 2, 2]` and support `[B, D]`: the sure nodes around, weighted by distance.
+        Flow `[B, D, 2]` px, gradient `[B, D, 2, 2]`, and support `[B, D]`, the number of certain nodes weighted by distance.
     """
     gradient = averages.gradient(weight, flow.mT, gradient.movedim(1, -1))
     predicted, support = averages.along(weight, flow.mT, gradient)

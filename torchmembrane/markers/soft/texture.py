@@ -1,4 +1,4 @@
-"""Texture located softly: normalised correlation with patches of the rest image, and soft-argmax, coarse to fine."""
+"""Soft location of texture: normalised correlation with patches of the rest image and soft-argmax, coarse to fine."""
 
 import numpy as np
 import torch
@@ -18,13 +18,13 @@ BELIEVED_CORRELATION = (0.5, 0.3)  # correlation from which a patch is believed,
 
 
 class PatchCorrelation(nn.Module):
-    """Normalised correlation of an image's level with patches of the rest image, over all whole shifts up to `reach`.
+    """Normalised correlation of one image level with patches of the rest image, over all integer shifts up to `reach`.
 
     Args:
-        rest: the level of the rest image `[1, 1, H, W]`.
-        centre: of the patches `[D, 2]`, px of the level.
+        rest: level of the rest image, `[1, 1, H, W]`.
+        centre: centres of the patches, `[D, 2]`, px of the level.
         radius: half side of a patch, px of the level.
-        reach: px of the level.
+        reach: largest shift, px of the level.
     """
 
     centre: Tensor
@@ -45,7 +45,8 @@ class PatchCorrelation(nn.Module):
         self.register_buffer("error", torch.full((len(centre),), float(reach), dtype=torch.float64))
 
     def forward(self, image: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Peak]:
-        """The patches about where `flow [B, D, 2]`, px of the level, puts them, warped by its `gradient [B, D, 2, 2]`.
+        """Search for the patches around their positions by `flow [B, D, 2]`, px of the level, warped by its
+        `gradient [B, D, 2, 2]`.
 
         Returns:
             Flow `[B, D, 2]`, px of the level, and the peak of the correlation, its place relative to that of `flow`.
@@ -60,12 +61,12 @@ class PatchCorrelation(nn.Module):
 
 
 class SoftTextureLocator(PatchLocator):
-    """Patches of a rest image in other images of the deformed membrane, by soft-argmax of their normalised correlation.
+    """Finds patches of a rest image in other images of the deformed membrane, by soft-argmax of their normalised correlation.
 
     Args:
         rest_image: `[H, W]`, grey in 0..1.
         pixels: patch centres `[D, 2]`, px, from `choose_patches`.
-        anchors: pixels `[A, 2]` on the rim, where nothing moves, or None.
+        anchors: fixed pixels on the rim, `[A, 2]`, or None.
 
     Raises:
         MembraneError: the image is not `[H, W]`, or there are too few patches, or some lie outside the image.
@@ -99,7 +100,7 @@ class SoftTextureLocator(PatchLocator):
 
         Args:
             image: `[B, 1, H, W]`, grey in 0..1, of the rest image's size.
-            previous: not used, as `follows` says.
+            previous: ignored, because `follows` is false.
 
         Raises:
             MembraneError: the image has another size than the rest image.

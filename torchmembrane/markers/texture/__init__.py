@@ -1,4 +1,4 @@
-"""Markers that are patches of texture: chosen in the rest image, followed into every other."""
+"""Texture patches as markers: chosen in the rest image and located in all other images."""
 
 from .locator import TextureLocator
 from .patches import choose_patches

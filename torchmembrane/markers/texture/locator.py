@@ -23,12 +23,12 @@ LOST_WEIGHT = 1e-3  # of a lost patch's predicted flow in its neighbours' fits: 
 
 
 class PatchLocator(nn.Module):
-    """Patches of a rest image: what the locators of texture share.
+    """Patches of a rest image: the common base of the texture locators.
 
     Args:
         rest_image: `[H, W]`, grey in 0..1.
         pixels: patch centres `[D, 2]`, px, from `choose_patches`.
-        anchors: pixels `[A, 2]` on the rim, where nothing moves, or None.
+        anchors: fixed pixels on the rim, `[A, 2]`, or None.
 
     Attributes:
         follows: False; patches are searched for from rest in every frame.
@@ -60,11 +60,11 @@ class PatchLocator(nn.Module):
 
     @staticmethod
     def rest_levels(rest_image: np.ndarray) -> list[Tensor]:
-        """The pyramid of the rest image `[H, W]`, each level `[1, 1, H, W]` in double precision."""
+        """Return the pyramid of the rest image `[H, W]`, each level `[1, 1, H, W]` in double precision."""
         return low_pass_pyramid(torch.as_tensor(np.asarray(rest_image, float))[None, None])
 
     def be_exact(self) -> None:
-        """As of `Locator`: nothing changes."""
+        """Do nothing: this locator has only one precision."""
 
     def check_size(self, image: Tensor) -> None:
         """Refuse an image that is not `[B, 1, H, W]` of the rest image's size."""
@@ -76,27 +76,28 @@ class PatchLocator(nn.Module):
             )
 
     def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, NeighbourFlow]:
-        """The flow `[B, D, 2]`: `found` where its neighbours bear it out, else what they predict, starting from `before`."""
+        """Return the flow `[B, D, 2]`: `found` where the neighbours confirm it, else their prediction, starting from
+        `before`."""
         guess = torch.where((weight > 0)[..., None], found, before)
         local = self.neighbourhood(guess, weight.clamp(min=LOST_WEIGHT), tolerance)
         trust = (weight * local.trust(found))[..., None]
         return trust * found + (1 - trust) * local.flow, local
 
     def located(self, found: Tensor, confidence: Tensor, local: NeighbourFlow) -> LocatedMarkers:
-        """The patches with the flow `found [B, D, 2]`, or what their neighbours predict where the `confidence [B, D]` is 0."""
+        """Return the patches with flow `found [B, D, 2]`, or their neighbours' prediction where `confidence [B, D]` is 0."""
         pixels = self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow)
         return LocatedMarkers(pixels, confidence, isotropic(confidence, LOCATION_NOISE))
 
 
 class TextureLocator(PatchLocator):
-    """Find the patches of a rest image again in other images of the deformed membrane.
+    """Finds the patches of a rest image in other images of the deformed membrane.
 
-    A patch is compared up to gain and offset of the light, warped by an affine map (normalised correlation).
+    Patches are compared by normalised correlation, invariant to gain and offset of the light, after an affine warp.
 
     Args:
         rest_image: `[H, W]`, grey in 0..1.
         pixels: patch centres `[D, 2]`, px, from `choose_patches`.
-        anchors: pixels `[A, 2]` on the rim, where nothing moves, or None.
+        anchors: fixed pixels on the rim, `[A, 2]`, or None.
 
     Raises:
         MembraneError: the image is not `[H, W]`, or there are too few patches, or some lie outside the image.
@@ -131,7 +132,7 @@ class TextureLocator(PatchLocator):
 
         Args:
             image: `[B, 1, H, W]`, grey in 0..1, of the rest image's size.
-            previous: not used, as `follows` says.
+            previous: ignored, because `follows` is false.
 
         Raises:
             MembraneError: the image has another size than the rest image.

@@ -1,4 +1,4 @@
-"""Patches of the rest image that can be followed."""
+"""Choice of patches of the rest image that can be followed."""
 
 import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
@@ -16,7 +16,7 @@ def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np
     Args:
         image: rest image `[H, W]`, grey in 0..1.
         mask: `[H, W]` bool, where the membrane is visible.
-        count: patches wanted if all of the mask were textured.
+        count: number of patches if all of the mask were textured.
 
     Returns:
         Patch centres `[D, 2]`, px, the best conditioned first.
@@ -59,7 +59,8 @@ def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np
 
 
 def weakest_gradient(image: np.ndarray) -> np.ndarray:
-    """Root of the structure tensor's smaller eigenvalue `[H, W]`, grey per px, over about a patch of `image [H, W]`."""
+    """Return the square root of the structure tensor's smaller eigenvalue, grey per px, `[H, W]`, over about a patch of the
+    image."""
     v, u = np.gradient(gaussian_filter(np.asarray(image, float), 1.0))
     uu, uv, vv = (gaussian_filter(product, PATCH_RADII[0] / 2) for product in (u * u, u * v, v * v))
     return np.sqrt(np.maximum((uu + vv) / 2 - np.sqrt((uu - vv) ** 2 / 4 + uv**2), 0.0))

@@ -1,4 +1,4 @@
-"""Patches of one level of the rest image: searched for by correlation, refined by Gauss-Newton steps."""
+"""Patches of one level of the rest image: found by correlation, refined by Gauss-Newton steps."""
 
 from math import isqrt
 
@@ -15,7 +15,7 @@ WARP_DAMPING = 1e-3  # grey^2: keeps weak texture from bending a patch's own aff
 
 
 def square_offsets(radius: int) -> Tensor:
-    """Integer offsets `[(2 radius + 1)^2, 2]` in rows of u.
+    """Return integer offsets `[(2 radius + 1)^2, 2]` in rows of u.
 
     Example:
         >>> square_offsets(1)[:4].tolist()
@@ -27,14 +27,14 @@ def square_offsets(radius: int) -> Tensor:
 
 
 class Template(nn.Module):
-    """Patches of one level of the rest image, and the Gauss-Newton steps that bring an image's patches onto them.
+    """Patches of one level of the rest image, and the Gauss-Newton steps that align an image's patches with them.
 
     With `T` the patch less its weighted mean, scaled to unit variance, and `S` its six derivatives (by shift, by affine
     map) made orthogonal to 1 and `T`, a step is `(S^T S)^-1 S^T I / (T . I)`: linear in the image `I` but for the gain.
 
     Args:
-        rest: the level of the rest image `[1, 1, H, W]`.
-        centre: of the patches `[D, 2]`, px of the level.
+        rest: level of the rest image, `[1, 1, H, W]`.
+        centre: centres of the patches, `[D, 2]`, px of the level.
         radius: half side of a patch, px of the level.
 
     Reference:
@@ -74,16 +74,16 @@ class Template(nn.Module):
         self.register_buffer("rows", torch.cat([weight.expand_as(unit), weight * unit, newton], 1))  # [D, 8, N]
 
     def forward(self, image: Tensor, flow: Tensor, gradient: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Bring the patches of an image onto the rest image's.
+        """Align the patches of an image with those of the rest image.
 
         Args:
-            image: the level of the image `[B, 1, H, W]`.
-            flow: `[B, D, 2]` to begin with, px of the level.
-            gradient: of the flow `[B, D, 2, 2]`.
-            steps: Gauss-Newton steps.
+            image: level of the image, `[B, 1, H, W]`.
+            flow: initial flow, `[B, D, 2]`, px of the level.
+            gradient: gradient of the flow, `[B, D, 2, 2]`.
+            steps: number of Gauss-Newton steps.
 
         Returns:
-            Flow `[B, D, 2]`, px of the level, and likeness `[B, D]` in 0..1 by correlation, before the last step.
+            Flow `[B, D, 2]`, px of the level, and similarity `[B, D]` in 0..1 by correlation, before the last step.
         """
         eye = torch.eye(2, dtype=flow.dtype, device=flow.device)
         affine = gradient + eye
@@ -100,12 +100,12 @@ class Template(nn.Module):
 
 
 def normalised_correlation(window: Tensor, unit: Tensor, weight: Tensor) -> Tensor:
-    """Correlation in -1..1 of patches with all whole shifts in windows of an image, `[B, D, n - s + 1, n - s + 1]`.
+    """Correlate patches with windows of an image at all integer shifts: -1..1, `[B, D, n - s + 1, n - s + 1]`.
 
     Args:
-        window: grey `[B, D, n^2]`, rows of u.
-        unit: the patches `[D, 1, s, s]`, weighted, as `Template.unit`.
-        weight: of their pixels `[1, 1, s, s]`, with sum 1.
+        window: grey values of the windows, `[B, D, n^2]`, in rows of u.
+        unit: weighted patches, `[D, 1, s, s]`, as in `Template.unit`.
+        weight: weights of the patches' pixels, `[1, 1, s, s]`, with sum 1.
     """
     side, patches = isqrt(window.shape[-1]), unit.shape[0]
     window = (window - window.mean(-1, keepdim=True)).unflatten(-1, (side, side))
@@ -137,7 +137,8 @@ class Search(nn.Module):
         self.register_buffer("near", torch.exp(-(shift[:, None] - shift).square().sum(-1) / 2))
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Shift `[B, D, 2]` of the highest correlation, px of the level, and a score `[B, D]` in 0..1: high and unique?"""
+        """Return the shift `[B, D, 2]` of the highest correlation, px of the level, and a score `[B, D]` in 0..1: high and
+        unique."""
         still = torch.eye(2, dtype=image.dtype, device=image.device).expand(image.shape[0], 1, 2, 2)
         window = sample(image, self.centre.expand(image.shape[0], -1, -1), still, self.offset)
         ncc = normalised_correlation(window, self.unit, self.weight).flatten(-2)
