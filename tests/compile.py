@@ -1,4 +1,4 @@
-"""Compiles the machine code of a frame in one precision, float32 or float64, before the tests start."""
+"""Compiles a frame's machine code in one precision before the tests."""
 
 import sys
 from dataclasses import replace

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from .interruption import unstoppable
 
+Constants = TypeVar("Constants")
 SECONDS = 45
 """Approximate time to compile the steps for one precision: 30 s on a core with AVX-512, 62 s on an AMD EPYC with AVX2."""
 
@@ -145,7 +146,7 @@ def fingerprint(*files: str | None) -> str:
     return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
 
 
-def row_major(constants: Any) -> Any:
+def row_major(constants: Constants) -> Constants:
     """Return the constants of a `kept` function, an array or (named) tuples of arrays, with contiguous arrays in row-major
     order. A function is compiled again for each memory layout of each array.
 
@@ -153,12 +154,14 @@ def row_major(constants: Any) -> Any:
         >>> row_major((np.zeros((3, 4))[:, :2], 1.0))[0].flags.c_contiguous
         True
     """
+    made: Any = constants
     if isinstance(constants, np.ndarray):
-        return np.ascontiguousarray(constants)
-    if not isinstance(constants, tuple):
-        return constants
-    each = map(row_major, constants)
-    return type(constants)(*each) if hasattr(constants, "_fields") else tuple(each)
+        made = np.ascontiguousarray(constants)
+    elif isinstance(constants, tuple):
+        each = map(row_major, constants)
+        made = type(constants)(*each) if hasattr(constants, "_fields") else tuple(each)
+    result: Constants = made
+    return result
 
 
 def aligned(size: int, dtype: np.dtype) -> np.ndarray:

@@ -91,13 +91,14 @@ class NativeSteps:
         constants, fixed = self._prepared(equations, cavity, measured)
         u, pressure, moved, earlier = (value.contiguous().numpy() for value in (*state, before))
         weights, given = np.empty((len(u), 0), u.dtype), np.array([[equations.loss.cone, far, 0, 0, 0]], float)
-        found = tuple(state[0].new_empty(shape) for shape in ((len(u), TOLD), state[0].shape, state[0].shape[:-1]))
+        shapes = (len(u), TOLD), state[0].shape, state[0].shape[:-1]
+        found = [state[0].new_empty(shape) for shape in shapes]
         told, traction, reference = (value.numpy() for value in found)
         grid = equations.forces.membrane.grid
         u, earlier, traction = (value.reshape(-1, *grid, 3) for value in (u, earlier, traction))
         each = [u, pressure, moved, weights, earlier, *fixed, traction, reference.reshape(-1, *grid), told]
         self._shared_out(equations, constants, each, given)
-        return found[0].unbind(1), *found[1:]
+        return found[0].unbind(1), found[1], found[2]
 
     def _prepared(
         self, equations: BalanceEquations, cavity: CavityLaw, measured: MeasuredRays
