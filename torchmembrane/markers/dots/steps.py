@@ -5,7 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from ..spacing import neighbours, safe_length
-from .scales import NEIGHBOURS
+
+NEIGHBOURS = 6
 
 
 class NeighbourSteps(nn.Module):
