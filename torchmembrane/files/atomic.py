@@ -12,7 +12,7 @@ from ..errors import MembraneError
 from ..interruption import unfinished
 
 PARTIAL = ".[0-9a-f]*-[0-9]*.partial"
-"""Pattern of what killed processes leave behind."""
+"""Name pattern of the temporary files that killed processes leave behind."""
 ROOM = "room on the disk: free some, or choose another place"
 LIMITS = "a file system, and a limit of files' size (ulimit -f), that take so large a file"
 WRITABLE = "a place where this user may write"
@@ -24,7 +24,7 @@ REMEDIES = {
     **dict.fromkeys((errno.ENOENT, errno.ENOTDIR), FOLDER),
     errno.ENAMETOOLONG: "a shorter name",
 }
-"""What is expected instead, by the error's number."""
+"""The text after "expected" in an error message, by the error number."""
 
 
 @contextmanager
@@ -93,20 +93,20 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write text in UTF-8, as `write_bytes` does."""
+    """Write text encoded as UTF-8, atomically as `write_bytes` does."""
     write_bytes(path, text.encode("utf-8"))
 
 
 @contextmanager
 def writing(path: Path, *others: Path) -> Iterator[None]:
-    """Turn the system's errors in the block into errors that name the file.
+    """Turn operating system errors raised in the block into errors that name the file.
 
     Args:
         path: the file that is written.
-        *others: temporary names of the file.
+        *others: temporary names under which the file is written.
 
     Raises:
-        MembraneError: in place of an `OSError` that names no file, or one of these.
+        MembraneError: replaces an `OSError` that names no file, or one of these files.
 
     Example:
         >>> with writing(Path("press.npz")):
@@ -128,7 +128,7 @@ some, or choose another place
 
 
 def make_folder(path: str | Path) -> Path:
-    """Make a folder, and those above it, where they are missing.
+    """Create a folder and its missing parents.
 
     Args:
         path: the folder.
@@ -137,7 +137,7 @@ def make_folder(path: str | Path) -> Path:
         The path.
 
     Raises:
-        MembraneError: it cannot be made, or there is a file of its name.
+        MembraneError: the folder cannot be created, or a file of this name exists.
     """
     path = Path(path)
     try:
@@ -151,10 +151,10 @@ def make_folder(path: str | Path) -> Path:
 
 
 def make_subfolder(path: Path) -> Path:
-    """Make a folder within a folder of results; a symbolic link in its place is refused.
+    """Create a folder inside a folder of results; refuse a symbolic link in its place.
 
     Raises:
-        MembraneError: as for `make_folder`; or the folder is a symbolic link.
+        MembraneError: as for `make_folder`; or the path is a symbolic link.
     """
     if path.is_symlink():
         raise MembraneError(f"{path}: is a symbolic link to {os.readlink(path)}; expected a folder of its own: remove the link")
@@ -162,10 +162,10 @@ def make_subfolder(path: Path) -> Path:
 
 
 def refuse_other_kind(path: Path) -> None:
-    """Refuse to replace a folder or a device by a file.
+    """Refuse to replace a folder or a device with a file.
 
     Raises:
-        MembraneError: there is one.
+        MembraneError: the path is a folder or a device.
         OSError: the path cannot be examined because its name is too long.
     """
     try:
@@ -177,6 +177,6 @@ def refuse_other_kind(path: Path) -> None:
 
 
 def kind_of(mode: int) -> str:
-    """A word for the kind of a file that is not a regular one, from its mode as in `os.stat`."""
+    """Return a word for the kind of a file that is not a regular file, from its `os.stat` mode."""
     kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
     return kinds.get(stat.S_IFMT(mode), "device")

@@ -1,24 +1,24 @@
-"""Colours of cameras whose pixels measure one colour each, in a Bayer pattern of 2 x 2 pixels."""
+"""Demosaicing of Bayer images, in which each pixel measures one colour of a 2 x 2 pattern."""
 
 import numpy as np
 from scipy.ndimage import correlate
 
 PATTERNS = ("rggb", "bggr", "gbrg", "grbg")
 CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
-"""Weights of the green pixels around one: of its own value, or of four neighbours."""
+"""Bilinear weights for green: the pixel's own value, or the mean of four neighbours."""
 SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
-"""Weights of the red or blue values: of a pixel's own, of two neighbours, or of four."""
+"""Bilinear weights for red or blue: the pixel's own value, or the mean of two or four neighbours."""
 
 
 def demosaiced(mosaic: np.ndarray, pattern: str) -> np.ndarray:
-    """Red, green and blue of every pixel; the two that it did not measure are interpolated bilinearly, which moves no edge.
+    """Return red, green and blue for every pixel; the two missing colours are interpolated bilinearly, which shifts no edge.
 
     Args:
-        mosaic: `[height, width]`, 2 x 2 or more, floating point.
-        pattern: one of `PATTERNS`, the colours of the image's first two pixels and of the two below them.
+        mosaic: raw image `[height, width]`, at least 2 x 2 pixels, floating point.
+        pattern: one of `PATTERNS`: the colours of the first two pixels of the image and of the two pixels below them.
 
     Returns:
-        `[height, width, 3]`, the values in the range of the mosaic's.
+        Colour image `[height, width, 3]` in the value range of the mosaic.
 
     Example:
         >>> demosaiced(np.array([[0.8, 0.4], [0.4, 0.2]]), "rggb")[0, 0].tolist()

@@ -1,8 +1,8 @@
-"""One reader for CSV tables that users write; it finds columns by their names.
+"""Reader for the CSV tables that users write; it finds columns by their names.
 
-What spreadsheets, editors and numpy leave in a file is passed over: a byte order mark, Windows' line ends, blank lines, lines
-of commas alone, commas and blanks at the ends of lines, quotes, capitals in names, comments after `#` and a blank. What is
-ambiguous is refused: semicolons, decimal commas, thousands separators, and columns that are repeated or unknown.
+It tolerates what spreadsheets, editors and numpy leave in a file: a byte order mark, Windows line endings, blank lines, lines
+of commas only, commas and blanks at the ends of lines, quotes, capitals in names, and comments after `#` and a blank. It
+refuses what is ambiguous: semicolons, decimal commas, thousands separators, and repeated or unknown columns.
 """
 
 import csv
@@ -19,7 +19,8 @@ from .safe_read import in_one_line, printable, read_text, shortened
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 COMMENT = re.compile(r"\s*#+(\s|$)")
 QUOTED = re.compile(r"[\w.,;+ ()\[\]-]{0,60}")
-"""A first line that a message quotes; of another one it tells the length alone, as the file may be anything."""
+"""A first line that an error message may quote; of any other line it states only the length, as the content may be
+arbitrary."""
 MINUS = str.maketrans({"\N{MINUS SIGN}": "-"})
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven")
 
@@ -28,12 +29,12 @@ class Columns(NamedTuple):
     """The columns that a table may have.
 
     Attributes:
-        forms: the names of columns that belong together; a table has those of one form, in any order.
-        of: what a line is about, in one word.
-        optional: a further column, which may be left out; empty: there is none.
-        unit: what the numbers are in, for messages.
-        least: lines.
-        most: lines; None: as many as there are.
+        forms: alternative sets of column names; a table has the columns of exactly one set, in any order.
+        of: what a line describes, in one word.
+        optional: name of one further column that may be left out; empty: none.
+        unit: unit of the numbers, for messages.
+        least: smallest number of lines.
+        most: largest number of lines; None: no limit.
     """
 
     forms: Sequence[tuple[str, ...]]
@@ -45,18 +46,18 @@ class Columns(NamedTuple):
 
     @property
     def expected(self) -> str:
-        """The columns in words."""
+        """Return a description of the expected columns for messages."""
         heads = " or ".join(map(",".join, self.forms)) + (f", each with ,{self.optional} or without" if self.optional else "")
         return f"{heads}, a line for each {self.of}" + (f", {self.unit}" if self.unit else "")
 
     def form_of(self, names: Sequence[str]) -> tuple[str, ...] | None:
-        """The form whose columns these are, in any order."""
+        """Return the form whose columns have these names, in any order, or None."""
         given = sorted(name for name in names if name != self.optional or names.count(name) > 1)
         return next((form for form in self.forms if sorted(form) == given), None)
 
 
 class Limit(NamedTuple):
-    """The largest magnitude that a number may have, and the number's name in messages."""
+    """The largest allowed magnitude of a number, and the name of the number in messages."""
 
     most: float = math.inf
     what: str = "a number"
@@ -71,9 +72,9 @@ class Row(NamedTuple):
 
     Attributes:
         path: the file.
-        line: its number, from 1.
-        places: places of the columns among the cells, by name.
-        cells: the line's.
+        line: line number, from 1.
+        places: index of each column among the cells, by column name.
+        cells: cells of the line.
     """
 
     path: Path
@@ -83,15 +84,15 @@ class Row(NamedTuple):
 
     @property
     def where(self) -> str:
-        """File and line, as messages begin."""
+        """Return the file and line with which a message begins."""
         return f"{self.path}, line {self.line}"
 
     def text(self, column: str) -> str:
-        """A cell as it is, without blanks around it."""
+        """Return the text of a cell, without surrounding blanks."""
         return self.cells[self.places[column]]
 
     def number(self, column: str, limit: Limit = ANY) -> float:
-        """A finite number within its limit; else a `MembraneError` that names file, line and column."""
+        """Return a finite number within its limit; otherwise raise a `MembraneError` that names file, line and column."""
         try:
             value = float(cell := self.text(column).translate(MINUS))
         except ValueError:
@@ -105,28 +106,28 @@ class Row(NamedTuple):
         return value
 
     def numbers(self, columns: Iterable[str], limit: Limit = ANY) -> list[float]:
-        """The finite numbers of several columns."""
+        """Return the finite numbers in several columns."""
         return [self.number(column, limit) for column in columns]
 
     def choice(self, column: str, choices: Sequence[str]) -> str:
-        """One of several words, in upper or lower case."""
+        """Return one of several allowed words, matched without regard to case."""
         word = self.text(column).lower()
         if word not in choices:
             raise self.refusal(column, " or ".join(choices))
         return word
 
     def refusal(self, column: str, expected: str) -> MembraneError:
-        """The error for a cell that is not what was expected."""
+        """Return the error for a cell that does not hold what was expected."""
         cell = shortened(printable(self.text(column)))
         return MembraneError(f"{self.where}: {column} = {cell if _is_number(cell) else repr(cell)}; expected {expected}")
 
 
 class Table(NamedTuple):
-    """A table as it was read.
+    """A table as read from its file.
 
     Attributes:
-        form: the expected form whose columns it has.
-        rows: its lines below the header.
+        form: the form in `Columns.forms` whose columns the table has.
+        rows: the lines below the header.
     """
 
     form: tuple[str, ...]
@@ -134,16 +135,16 @@ class Table(NamedTuple):
 
 
 def read_table(path: Path, columns: Columns, most_bytes: int) -> Table:
-    """Read the lines of a table; a cell is checked when it is asked for.
+    """Read the lines of a table; each cell is checked when it is accessed.
 
     Args:
-        path: path of the file, CSV.
-        columns: that it may have.
-        most_bytes: that it may hold.
+        path: path of the CSV file.
+        columns: columns that the table may have.
+        most_bytes: largest allowed file size in bytes.
 
     Raises:
-        MembraneError: no such file, no text, no CSV, other columns, a line of more or fewer cells than columns, too few or too
-            many lines; names file and line, what came, what was expected, and the remedy.
+        MembraneError: the file is missing, is not text or not CSV, has other columns, a line with too many or too few cells, or
+            too few or too many lines; the message names file and line, what was found, what was expected, and the remedy.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -168,7 +169,8 @@ def read_table(path: Path, columns: Columns, most_bytes: int) -> Table:
 
 
 def _rows(lines: list[str]) -> tuple[list[tuple[int, list[str]]], str]:
-    """The lines that are not empty, each with its number and cells, and the damage that ended them early, or ""."""
+    """Return the non-empty lines, each with its number and cells, and a description of the damage that ended them early, or
+    ""."""
     reader = csv.reader(("\n" if COMMENT.match(line) else line for line in lines), strict=True, skipinitialspace=True)
     rows = []
     try:
@@ -184,7 +186,7 @@ def _rows(lines: list[str]) -> tuple[list[tuple[int, list[str]]], str]:
 def _header(
     path: Path, columns: Columns, rows: list[tuple[int, list[str]]], lines: list[str]
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The names of the columns, and the lines below them; a comment may name them, as numpy writes it."""
+    """Return the column names and the lines below them; the names may stand in a comment, as numpy writes them."""
     line, first = rows[0] if rows else (1, ["nothing"])
     if columns.form_of(names := _names(first)):
         return names, rows[1:]
@@ -202,7 +204,7 @@ def _header(
 
 
 def _names(cells: Sequence[str]) -> list[str]:
-    """The names in a header, normalised for comparison and without empty ones at its end."""
+    """Return the names in a header, normalised for comparison, without empty names at the end."""
     names = [re.sub(r"[\s-]+", "_", cell.strip().lower()) for cell in cells]
     while names and not names[-1]:
         names.pop()

@@ -1,4 +1,4 @@
-"""Image files decoded by Pillow: bounded in size, with the values as stored; damaged files are refused."""
+"""Decoding of image files with Pillow: size is bounded, values are returned as stored, and damaged files are refused."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -19,9 +19,9 @@ from .tiff import refuse_damaged_page, refuse_displaced
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 MOST_PIXELS = 2**25
 KIND, OLD_KIND, WIDTH, HEIGHT, BITS_PER_SAMPLE, PHOTOMETRIC, DESCRIPTION, ORIENTATION = 254, 255, 256, 257, 258, 262, 270, 274
-"""Tags of a TIFF's page."""
+"""Tag numbers of a TIFF page."""
 REDUCED_OR_MASK, OLD_REDUCED, WHITE_IS_ZERO = 0b101, 2, 0
-"""Values of these tags."""
+"""Values of the TIFF tags above."""
 UNTURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda values: values,
     2: lambda values: values[:, ::-1],
@@ -32,17 +32,17 @@ UNTURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda values: values[::-1, ::-1].swapaxes(0, 1),
     8: lambda values: np.rot90(values, -1),
 }
-"""By orientation: an image as it is stored, from one that was turned by it. Cameras turn no image of a sensor."""
+"""For each orientation tag, the function that undoes the rotation or reflection. Sensor cameras do not rotate images."""
 IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
 
 
 class Stored(NamedTuple):
-    """A picture as its file stores it.
+    """A picture as stored in its file.
 
     Attributes:
-        values: `[height, width]` or `[height, width, 3]`.
-        bits: used bits of a value, where the file states fewer than 16.
-        halved: whether only the upper 8 of the file's 16 bits are left.
+        values: pixel values `[height, width]` or `[height, width, 3]`.
+        bits: number of used bits per value, if the file declares fewer than 16.
+        halved: whether only the upper 8 bits of the file's 16 bits were read.
     """
 
     values: np.ndarray
@@ -52,14 +52,14 @@ class Stored(NamedTuple):
 
 @contextmanager
 def opened(path: str | Path, file: IO[bytes]) -> Iterator[Image.Image]:
-    """Open an image and read its header; any failure inside the block becomes an error that names the file.
+    """Open an image and read its header; any failure inside the block is raised as an error that names the file.
 
     Args:
-        path: what messages call it.
-        file: with its content.
+        path: name of the file in messages.
+        file: open file with the content.
 
     Raises:
-        MembraneError: it is no image, too large, or damaged.
+        MembraneError: the file is not an image, is too large, or is damaged.
     """
     expected = "a whole PNG, JPEG or TIFF"
     try:
@@ -75,14 +75,14 @@ def opened(path: str | Path, file: IO[bytes]) -> Iterator[Image.Image]:
 
 
 def pictures(image: Image.Image) -> Iterator[int]:
-    """Go to each picture of an opened image in turn, and yield the indices of those that are frames.
+    """Seek to each picture of an opened image in turn, and yield the indices of those that are frames.
 
-    What belongs to a picture is passed over: previews and masks of a TIFF, pictures of other sizes in an MPO, which are its
-    previews and gain maps.
+    Auxiliary pictures are skipped: previews and masks in a TIFF, and pictures of another size in an MPO, which are previews and
+    gain maps.
 
     Raises:
-        MembraneError: the file says that it holds pictures to which its directory does not lead.
-        Exception: of `DAMAGE`, where a picture's place is not readable.
+        MembraneError: the file declares pictures to which its directory does not lead.
+        Exception: one of `DAMAGE`, if a picture cannot be located.
     """
     size, place, held = image.size, 0, 0
     while True:
@@ -111,7 +111,7 @@ def _belongs_to_another(image: Image.Image, size: tuple[int, int]) -> bool:
 
 
 def _told(image: Image.Image) -> int:
-    """The number of pictures that a TIFF of ImageJ declares; ImageJ omits the pages of large stacks."""
+    """Return the number of pictures that an ImageJ TIFF declares; ImageJ omits the pages of large stacks."""
     if image.format != "TIFF":
         return 0
     image.seek(0)
@@ -120,15 +120,15 @@ def _told(image: Image.Image) -> int:
 
 
 def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
-    """The current picture of an opened image.
+    """Return the current picture of an opened image.
 
     Args:
-        image: as for `opened` gives it.
-        size: width and height that it must have, px; it is looked at before pixels are decoded.
+        image: an image as yielded by `opened`.
+        size: required width and height, px; checked before any pixel is decoded.
 
     Raises:
-        MembraneError: another size.
-        Exception: of `DAMAGE`, where it is not decodable.
+        MembraneError: the image has another size.
+        Exception: one of `DAMAGE`, if the picture cannot be decoded.
     """
     found, turned = stored_size(image), _orientation(image)
     if size is not None and found != size:
@@ -149,26 +149,26 @@ def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
-    """Width and height of an opened image as they are stored, px."""
+    """Return the width and height of an opened image as stored, px."""
     tags = image.tag_v2 if image.format == "TIFF" else {}  # type: ignore[attr-defined]
     return tags.get(WIDTH, image.width), tags.get(HEIGHT, image.height)
 
 
 def _orientation(image: Image.Image) -> int:
-    """The orientation that Pillow applies when it loads an image: only that of a TIFF."""
+    """Return the orientation that Pillow applies when it loads an image; it does so only for TIFF files."""
     stated = image.tag_v2.get(ORIENTATION, 1) if image.format == "TIFF" else 1  # type: ignore[attr-defined]
     return stated if stated in UNTURNED else 1
 
 
 def refuse_damaged(image: Image.Image, content: bytes) -> None:
-    """Refuse damage that the decoder ignores: wrong checksums of PNG and TIFF, warnings of libjpeg, wrong lengths in a WebP.
+    """Refuse damage that the decoder ignores: wrong PNG or TIFF checksums, libjpeg warnings, wrong lengths in a WebP file.
 
     Args:
-        image: that was loaded.
-        content: content of its file; of a JPEG among several in a file, from its beginning on.
+        image: an image that has been loaded.
+        content: content of its file; for a JPEG that is one of several in a file, the content from its first byte on.
 
     Raises:
-        ValueError: it is damaged; of a PNG others of `DAMAGE` as well.
+        ValueError: the image is damaged; for a PNG also other exceptions of `DAMAGE`.
     """
     if image.format == "PNG":
         with Image.open(BytesIO(content), formats=FORMATS) as twin:
@@ -186,7 +186,7 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
 
 
 def _fills_its_file(riff: bytes) -> bool:
-    """Whether the declared lengths of a RIFF file's chunks add up to the length of the file."""
+    """Return whether the declared chunk lengths of a RIFF file add up to the length of the file."""
     at, end = 12, 8 + int.from_bytes(riff[4:8], "little")
     while at < end:
         size = int.from_bytes(riff[at + 4 : at + 8], "little")

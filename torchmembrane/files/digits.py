@@ -1,15 +1,15 @@
-"""The number of digits to write, which depends on the size of a number because lengths may be in any unit."""
+"""The number of decimal places to write, chosen by the size of a number because lengths may have any unit."""
 
 import math
 
 import numpy as np
 
 STORED = 7
-"""Digits of the largest coordinate in a list of positions: of a membrane of 24 mm, hundredths of a micrometre."""
+"""Significant digits of the largest coordinate in a stored list of positions: 0.01 um for a membrane of 24 mm."""
 
 
 def decimals(size: float, digits: int) -> int:
-    """Decimal places with which a number of this size has `digits` digits; 0 for zero and for numbers that are not finite.
+    """Return the number of decimals that shows a number of this size with `digits` digits; 0 for zero and non-finite numbers.
 
     Example:
         >>> decimals(24.0, 3), decimals(0.024, 3), decimals(24000.0, 3)
@@ -19,7 +19,7 @@ def decimals(size: float, digits: int) -> int:
 
 
 def together(values: np.ndarray, digits: int) -> str:
-    """Components of a vector with their signs; all have as many decimal places as the largest needs for `digits` digits.
+    """Format the components of a vector with signs; all get the number of decimals that the largest needs for `digits` digits.
 
     Example:
         >>> together(np.array([0.00123, -0.04567, 0.0]), 3)
@@ -30,7 +30,7 @@ def together(values: np.ndarray, digits: int) -> str:
 
 
 def rounded(positions: np.ndarray) -> np.ndarray:
-    """Positions `[D, 3]`, rounded to `STORED` digits of their extent.
+    """Return positions `[D, 3]` rounded to `STORED` significant digits of their extent.
 
     Example:
         >>> rounded(np.array([[0.0, 0.0, 1 / 3], [12.0, 0.0, 2 / 3]])).tolist()

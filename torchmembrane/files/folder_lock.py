@@ -1,4 +1,4 @@
-"""Locks of folders: one job, or several shards of one job, may write into a folder."""
+"""Folder locks: only one job, or the shards of one job, may write into a folder at a time."""
 
 import zlib
 from contextlib import suppress
@@ -17,11 +17,12 @@ PATIENCE = 600.0
 
 
 class Shard(NamedTuple):
-    """One of `total` disjoint parts of a job. A frame's shard depends only on its name, so it is the same on every machine.
+    """One of `total` disjoint parts of a job. The shard of a frame depends only on the frame's name, so all machines agree on
+    it.
 
     Attributes:
-        number: 1 to `total`.
-        total: number of all shards.
+        number: number of this shard, from 1 to `total`.
+        total: total number of shards.
 
     Example:
         >>> shards = [Shard(1, 2), Shard(2, 2)]
@@ -33,29 +34,29 @@ class Shard(NamedTuple):
     total: int = 1
 
     def holds(self, name: str) -> bool:
-        """Whether a frame of this name belongs to this shard."""
+        """Return whether a frame of this name belongs to this shard."""
         return zlib.crc32(name.encode()) % self.total == self.number - 1
 
 
 WHOLE = Shard()
-"""Not divided."""
+"""The only shard of a job that is not divided."""
 
 
 class FolderLock:
     """A folder locked for writing: `with FolderLock(folder, shard) as lock`, and `with lock.write_lock` to change its files.
 
-    The locks are the operating system's: they end with the process, however that ends.
+    The locks belong to the operating system, which releases them when the process ends, in whatever way.
 
     Args:
-        folder: it is made if it does not exist.
-        shard: which part of a job writes there; the shards of one division may write at once.
+        folder: folder to lock; it is created if it does not exist.
+        shard: the part of a job that is written here; shards of the same division may write at the same time.
 
     Attributes:
-        write_lock: a lock that one shard holds at a time.
+        write_lock: a lock that only one shard can hold at a time.
         alone: whether no other shard was writing when the folder was locked.
 
     Raises:
-        MembraneError: on entering: another job, the same shard, or shards of another division are writing there.
+        MembraneError: on entering, if another job, the same shard, or a shard of another division is writing to the folder.
     """
 
     def __init__(self, folder: Path, shard: Shard):
@@ -96,7 +97,7 @@ def _said(lock: str) -> str:
 
 
 def _remove(lock: BaseFileLock) -> None:
-    """Delete the file of a held lock; a process that waits for it notices and makes a new one."""
+    """Delete the file of a held lock; a process that waits for the lock notices this and creates a new file."""
     with suppress(OSError):  # Windows keeps open files
         Path(lock.lock_file).unlink()
 

@@ -25,20 +25,20 @@ THREE_FRAMES = (
 def to_grayscale_batch(
     images: Tensor | np.ndarray, size: tuple[int, int], channels: Channels, like: Tensor, bits: int | None = None
 ) -> Tensor:
-    """Grey images `[B, 1, height, width]` in 0..1, of the precision and on the device of `like`.
+    """Convert images to grey values `[B, 1, height, width]` in 0..1, with the dtype and on the device of `like`.
 
     Args:
-        images: torch or numpy, `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`; uint8, uint16 or
-            float in 0..1. Grey is 0.299 R + 0.587 G + 0.114 B. Three grey frames `[3, H, W]` might be the colours of one image
-            and cause a warning.
-        size: width and height, px.
-        channels: order of the three channels, "rgb" or "bgr".
-        like: a tensor.
-        bits: bits of the camera, if fewer than the 16 of uint16 images: white is `2^bits - 1`.
+        images: torch or numpy images, `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`; uint8,
+            uint16 or float in 0..1. Grey is 0.299 R + 0.587 G + 0.114 B. A shape `[3, H, W]` is read as three grey frames, with
+            a warning because it might be one colour image.
+        size: width and height of the sensor's images, px.
+        channels: order of the three colour channels, "rgb" or "bgr".
+        like: tensor that sets the dtype and device of the result.
+        bits: bit depth of the camera, if uint16 images use fewer than 16 bits: white is `2^bits - 1`.
 
     Raises:
-        MembraneError: another shape, size or type, or values beyond `bits`; says what came, what was expected, and how to
-            permute.
+        MembraneError: the images have another shape, size or type, or values beyond `bits`; the message states what was given,
+            what was expected, and how to permute the axes.
 
     Example:
         >>> photograph = np.zeros((480, 640, 3), np.uint8)
@@ -62,15 +62,15 @@ def to_grayscale_batch(
 
 
 def check_image(name: str, image: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
-    """An image's array `[H, W]`.
+    """Return an image as an array `[H, W]`.
 
     Args:
-        name: what an error calls it.
+        name: name of the image in error messages.
         image: an array or a tensor.
-        size: width and height that it must have, px; None: any.
+        size: required width and height, px; None: any size.
 
     Raises:
-        MembraneError: another shape.
+        MembraneError: the image has another shape.
 
     Example:
         >>> check_image("depth", np.zeros((3, 4)), (4, 3)).shape
@@ -94,7 +94,7 @@ def _tensor(images: Tensor | np.ndarray) -> Tensor:
 
 
 def _planes(pixels: Tensor, size: tuple[int, int]) -> list[Tensor]:
-    """The one or three channels, `[B, H, W]` each."""
+    """Return the one or three channels, `[B, H, W]` each."""
     shape = tuple(pixels.shape)
     if shape[-2:] == size and len(shape) == 2:
         return [pixels[None]]

@@ -1,4 +1,4 @@
-"""Image files as grey values, 0.299 R + 0.587 G + 0.114 B in floating point, computed in the same way everywhere."""
+"""Image files read as grey values, 0.299 R + 0.587 G + 0.114 B in floating point; all readers compute them in the same way."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,33 +18,34 @@ from .safe_read import DAMAGE, in_one_line, read_bytes, regular_size
 from .tiff import refuse_damaged_page
 
 MOST_IMAGE_BYTES, MOST_STACK_BYTES = 2**28, 2**32
-"""Largest file; largest TIFF of several pages, which are read one by one."""
+"""Largest size in bytes of an image file, and of a multi-page TIFF, whose pages are read one by one."""
 MOST_PICTURES = 2**17
-"""In a file."""
+"""Largest number of pictures in a file."""
 GREY = (0.299, 0.587, 0.114)
 
 
 def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int | None = None) -> np.ndarray:
-    """An image file's grey values, float32 `[height, width]` in 0..1.
+    """Return the grey values of an image file, float32 `[height, width]` in 0..1.
 
-    Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored. EXIF orientation is not applied: pixels are
-    the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit). Any warning of a decoder is an error, except for
-    padding in a JPEG: wrong checksums of PNG, corrupt or missing data in JPEG, inconsistent lengths in WebP.
+    Supported are grey images of 8 and 16 bits and of floats (TIFF), RGB, palette and CMYK; alpha is ignored. The EXIF
+    orientation is not applied: pixels stay where the camera measured them. Colour of 16 bits is reduced to 8 bits (a limit of
+    Pillow). Any decoder warning is an error, except for padding in a JPEG: wrong PNG checksums, corrupt or missing JPEG data,
+    inconsistent lengths in a WebP file.
 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file with one picture.
-        size: width and height that it must have, px; it is looked at before pixels are decoded.
-        bits: bits of the camera, where 16-bit files hold fewer; None: as the file says, or 16.
+        size: required width and height, px; checked before any pixel is decoded.
+        bits: bit depth of the camera, if 16-bit files use fewer bits; None: as the file declares, or 16.
 
     Returns:
         Grey values.
 
     Raises:
-        MembraneError: the file is missing, no image, too large, of another size, truncated or damaged, or it has several
-            pictures or values beyond `bits`; names the file and the cause.
+        MembraneError: the file is missing, not an image, too large, of another size, truncated or damaged, or it has several
+            pictures or values beyond `bits`; the message names the file and the cause.
 
     Limitations:
-        TIFF, BMP, WebP and JPEG have no checksums of their pixels: damage that leaves the file well formed is not noticed here.
+        TIFF, BMP, WebP and JPEG have no pixel checksums: damage that leaves such a file well formed is not detected.
 
     Example:
         >>> image = read_image("examples/rest.png")
@@ -55,12 +56,12 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int 
 
 
 def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None = None, bits: int | None = None) -> np.ndarray:
-    """The grey values of an image file's content, as `read_image` gives them.
+    """Return the grey values of an image file's content, as `read_image` does for a file.
 
     Args:
         content: content of a PNG, JPEG, BMP, TIFF or WebP file.
-        name: what an error calls it.
-        size: width and height that it must have, px.
+        name: name of the file in error messages.
+        size: required width and height, px.
         bits: as for `read_image`.
 
     Raises:
@@ -73,11 +74,11 @@ def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None 
 
 
 def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
-    """The values of an image file as they are stored, `[height, width]` or `[height, width, 3]`.
+    """Return the values of an image file as stored, `[height, width]` or `[height, width, 3]`.
 
     Args:
-        name: its path.
-        content: what the file holds; default: it is read.
+        name: path of the file.
+        content: content of the file; default: it is read from `name`.
 
     Raises:
         MembraneError: as for `read_image`.
@@ -94,7 +95,7 @@ def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of an image file, px, without decoding its pixels.
+    """Return the width and height of an image file, px, without decoding its pixels.
 
     Args:
         path: as for `read_image`.
@@ -111,8 +112,8 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def picture_count(path: Path, most: int = MOST_PICTURES) -> int:
-    """How many pictures a file has, up to so many: pages of a TIFF, frames of an animated PNG or WebP, pictures of an MPO; 0
-    where it is no image that is read here.
+    """Return the number of pictures in a file, at most `most`: pages of a TIFF, frames of an animated PNG or WebP, or pictures
+    of an MPO; 0 if the file is not an image that this package reads.
 
     Example:
         >>> picture_count(Path("examples/rest.png")), picture_count(Path("examples/sensor.toml"))
@@ -129,18 +130,18 @@ def picture_count(path: Path, most: int = MOST_PICTURES) -> int:
 
 
 def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterator[np.ndarray | MembraneError]:
-    """The pictures of a file one after another, as `read_image` gives one; in place of one that cannot be read, the error.
+    """Yield the pictures of a file one by one as `read_image` returns them; for an unreadable picture, yield the error instead.
 
     Args:
-        path: a PNG, JPEG, BMP, TIFF or WebP file of one picture or more.
-        size: width and height that they must have, px.
+        path: a PNG, JPEG, BMP, TIFF or WebP file with one or more pictures.
+        size: required width and height, px.
         bits: as for `read_image`.
 
     Yields:
         Grey values, or an error that does not name the file.
 
     Raises:
-        MembraneError: the file is no image, too large, or damaged so that no further picture is found.
+        MembraneError: the file is not an image, is too large, or is so damaged that no further picture can be found.
     """
     number = 0
     with _opened_stack(path) as (image, file):
@@ -174,7 +175,7 @@ def _picture(
 
 
 def _grey_of(image: Image.Image, size: tuple[int, int] | None, bits: int | None) -> np.ndarray:
-    """The current picture's grey values."""
+    """Return the grey values of the current picture."""
     found = stored(image, size)
     if found.halved and bits is not None:
         raise ValueError(f"its values are colour of 16 bits, of which 8 are read, so bits = {bits} is lost: save them as grey")
@@ -190,7 +191,7 @@ def _content(path: str | Path) -> bytes:
 
 @contextmanager
 def _opened_single(path: str | Path, content: bytes) -> Iterator[Image.Image]:
-    """The image of a file that must have one picture."""
+    """Open the image of a file that must have exactly one picture."""
     with opened(path, BytesIO(content)) as image:
         places = list(islice(pictures(image), MOST_PICTURES))
         if len(places) != 1:
@@ -205,7 +206,7 @@ def _opened_single(path: str | Path, content: bytes) -> Iterator[Image.Image]:
 
 @contextmanager
 def _opened_stack(path: Path) -> Iterator[tuple[Image.Image, IO[bytes]]]:
-    """The image of a file, which is read only as far as pictures are asked for, and the file."""
+    """Open an image file that is read only as far as pictures are requested; yield the image and the file."""
     expected = "a readable image file"
     try:
         regular_size(path, MOST_STACK_BYTES, expected)
@@ -217,14 +218,14 @@ def _opened_stack(path: Path) -> Iterator[tuple[Image.Image, IO[bytes]]]:
 
 
 def mean_image(paths: Sequence[Path], bits: int | None = None) -> np.ndarray:
-    """The mean of the grey values of image files of one size, float32 `[height, width]` in 0..1.
+    """Return the mean grey values of image files of one size, float32 `[height, width]` in 0..1.
 
     Args:
-        paths: one file or more.
+        paths: one or more files.
         bits: as for `read_image`.
 
     Raises:
-        MembraneError: as for `read_image`; or the images differ in size.
+        MembraneError: as for `read_image`; or the images have different sizes.
     """
     first = image_size(paths[0])
     for path in paths[1:]:
@@ -238,14 +239,14 @@ def mean_image(paths: Sequence[Path], bits: int | None = None) -> np.ndarray:
 
 
 def to_grey(array: np.ndarray, bits: int | None = None) -> np.ndarray:
-    """Grey values of an array as float32 `[height, width]` in 0..1.
+    """Convert an array to grey values, float32 `[height, width]` in 0..1.
 
     Args:
         array: `[height, width]` grey or `[height, width, 3]` RGB; uint8 (0..255), uint16 (0..65535) or float (0..1).
-        bits: bits of the camera, where a uint16 holds fewer: white is `2^bits - 1`.
+        bits: bit depth of the camera, if uint16 values use fewer than 16 bits: white is `2^bits - 1`.
 
     Raises:
-        MembraneError: another shape or type, a value not finite, outside 0..1 or beyond `bits`.
+        MembraneError: the array has another shape or type, or a value that is not finite, outside 0..1 or beyond `bits`.
 
     Returns:
         Grey values.
@@ -278,17 +279,17 @@ def to_grey(array: np.ndarray, bits: int | None = None) -> np.ndarray:
 
 
 def write_image(stem: str | Path, grey: np.ndarray, bits: int | None = None) -> Path:
-    """Write grey values so that `read_image` gives the same numbers.
+    """Write grey values to a file from which `read_image` returns the same numbers.
 
-    PNG of 8 or 16 bits where that holds the values exactly, else a TIFF of floats. The file is written atomically.
+    The file is a PNG of 8 or 16 bits if that holds the values exactly, otherwise a TIFF of floats. It is written atomically.
 
     Args:
-        stem: the file without its ending, `.png` or `.tiff`.
-        grey: `[height, width]` in 0..1.
-        bits: bits of the camera, with which it will be read.
+        stem: path of the file without its extension; `.png` or `.tiff` is added.
+        grey: grey values `[height, width]` in 0..1.
+        bits: bit depth of the camera that will be passed to `read_image`.
 
     Returns:
-        The path.
+        The path of the file.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -306,16 +307,16 @@ def write_image(stem: str | Path, grey: np.ndarray, bits: int | None = None) -> 
 
 
 def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None) -> Path:
-    """Write an image as a camera gave it, losslessly, fast and atomically.
+    """Write an image exactly as the camera delivered it: lossless, fast and atomic.
 
     Args:
-        stem: the file without its ending, `.png` or `.tiff`.
-        image: `[height, width]` uint8 or uint16, `[height, width, 3]` uint8, or grey values as for `write_image`; of
+        stem: path of the file without its extension; `.png` or `.tiff` is added.
+        image: `[height, width]` uint8 or uint16, `[height, width, 3]` uint8, or grey values as for `write_image`; for
             `[height, width, 3]` uint16 the grey values are written.
-        bits: bits of the camera, with which it will be read.
+        bits: bit depth of the camera that will be passed to `read_image`.
 
     Returns:
-        The path.
+        The path of the file.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -332,7 +333,7 @@ def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None)
 
 
 def _written(path: Path, values: np.ndarray, **options: int) -> Path:
-    """Write an image atomically, in the format of the file name's ending."""
+    """Write an image atomically, in the format given by the extension of the file name."""
     with whole_file(path) as partial:
         Image.fromarray(np.ascontiguousarray(values)).save(partial, "TIFF" if path.suffix == ".tiff" else "PNG", **options)
     return path

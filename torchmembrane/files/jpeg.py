@@ -1,4 +1,4 @@
-"""JPEG files as cameras write them: whole ones, those with padding, and those that are damaged."""
+"""Checks of JPEG files from cameras: complete files, files with padding, and damaged files."""
 
 import re
 from collections.abc import Iterator
@@ -6,34 +6,35 @@ from itertools import pairwise
 
 END = b"\xff\xd9"
 FRAMES = (0xC0, 0xC1, 0xC2)
-"""Markers that begin the header of a frame coded by Huffman's method."""
+"""Markers that begin the header of a Huffman-coded frame."""
 SCAN, RESTART_INTERVAL = 0xDA, 0xDD
 FILL, BARE = 0xFF, (0x01, *range(0xD0, 0xD9))
-"""The byte that may fill the space before a marker, and the markers without a segment."""
+"""The fill byte that may precede a marker, and the markers that have no segment."""
 RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 SEGMENT = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-"""Markers within the data of a scan, and behind them."""
+"""Patterns of the restart markers within scan data, and of the markers after it."""
 FEWEST_ALIKE = 4
-"""Bytes at the end of data that are taken for padding because they are alike."""
+"""Smallest number of equal bytes at the end of the data that is taken for padding."""
 MOST_DATA_ALIKE = 2
-"""Bytes of the data that may be like the padding behind them; where more are, a camera has filled up what it lost."""
+"""Largest number of data bytes that may equal the padding after them; if there are more, the camera has filled lost data."""
 MOST_ODD = 16
-"""Bytes of padding that are not alike."""
+"""Largest number of padding bytes that are not all equal."""
 LONGEST_SIDE = 65535
 
 
 def is_whole(content: bytes) -> bool:
-    """Whether a JPEG file's picture is complete: the decoder gives no warning, or only one about padding.
+    """Return whether a JPEG file is complete: the decoder gives no warning, or only a warning about padding.
 
-    Some cameras put bytes between the data of a picture, or of a restart interval, and the marker behind it: any number of them
-    that are alike, or up to `MOST_ODD`. Such padding is no damage. What ends early, or is not decodable, is damaged.
+    Some cameras put padding bytes between the data of a picture, or of a restart interval, and the next marker: any number of
+    equal bytes, or up to `MOST_ODD` arbitrary ones. Such padding is not damage. A picture that ends early or cannot be decoded
+    is damaged.
 
     Args:
-        content: content of the file, grey or of three colours.
+        content: content of the file, grey or with three colours.
 
     Limitations:
-        A decoder that loses its place in damaged data and ends up to `MOST_ODD` bytes early is not noticed, nor is damage for
-        which the decoder gives no warning.
+        Damage is not detected if the decoder gives no warning for it, or if the decoder loses synchronisation and ends up to
+        `MOST_ODD` bytes early.
 
     Example:
         >>> from io import BytesIO
@@ -50,7 +51,7 @@ def is_whole(content: bytes) -> bool:
 
 
 def _is_decoded(content: bytes) -> bool:
-    """Whether libjpeg decodes a file without a warning."""
+    """Return whether libjpeg decodes a file without a warning."""
     from kornia_rs.io import ImageDecoder
 
     try:
@@ -61,8 +62,8 @@ def _is_decoded(content: bytes) -> bool:
 
 
 def _without_padding(content: bytes) -> Iterator[Iterator[bytes]]:
-    """For each restart interval, files of it alone that end where its data may end; the whole picture is one interval where
-    there are no restart markers, or several scans."""
+    """For each restart interval, yield candidate files that contain this interval alone and end where its data may end; the
+    picture is treated as one interval if it has no restart markers or several scans."""
     header = _Header.from_bytes(content)
     end = content.find(END, header.length) if header else -1
     if header is None or end < 0:
@@ -84,7 +85,7 @@ def _without_padding(content: bytes) -> Iterator[Iterator[bytes]]:
 
 
 def _shorter(data: bytes) -> Iterator[bytes]:
-    """Data without what may be padding at their end."""
+    """Yield the data with possible padding at the end removed."""
     other = len(data.rstrip(data[-1:]))
     if len(data) - other >= FEWEST_ALIKE:
         yield from (data[: other + kept] for kept in range(MOST_DATA_ALIKE + 1))
@@ -96,11 +97,11 @@ class _Header:
     """The part of a file before the data of its first scan.
 
     Attributes:
-        length: bytes.
-        size_at: where the picture's size stands.
+        length: length of the header in bytes.
+        size_at: offset of the picture size.
         size: height and width of the picture, px.
-        unit: height and width of the units that it is coded in, px.
-        restart: units of a restart interval; 0 where there are none.
+        unit: height and width of a coding unit (MCU), px.
+        restart: number of coding units in a restart interval; 0 if there are none.
     """
 
     def __init__(self, content: bytes, length: int, frame: int, restart: int):
@@ -111,7 +112,7 @@ class _Header:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> "_Header | None":
-        """The header of a file whose segments are in order; None for another file."""
+        """Return the header of a file whose segments are in order, or None for any other file."""
         at, frame, restart = 2, 0, 0
         while at + 4 <= len(content) and content[at] == 0xFF:
             marker, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4], "big")
@@ -128,7 +129,7 @@ class _Header:
         return None
 
     def interval_sizes(self) -> Iterator[tuple[int, int]]:
-        """Height and width of pictures of as many units as each restart interval has, px."""
+        """Yield, for each restart interval, the height and width of a picture with as many coding units, px."""
         rows, columns = (-(-side // unit) for side, unit in zip(self.size, self.unit, strict=True))
         for first in range(0, rows * columns, self.restart):
             units = min(self.restart, rows * columns - first)
@@ -136,6 +137,6 @@ class _Header:
             yield lines * self.unit[0], wide * self.unit[1]
 
     def of_size(self, content: bytes, size: tuple[int, int]) -> bytes:
-        """The header with another height and width of the picture."""
+        """Return the header with the height and width of the picture replaced."""
         sides = b"".join(side.to_bytes(2, "big") for side in size)
         return content[: self.size_at] + sides + content[self.size_at + 4 : self.length]

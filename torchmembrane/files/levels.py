@@ -1,4 +1,4 @@
-"""Grey levels: which level is white if a camera has fewer bits than its images are stored with."""
+"""Grey levels: which level is white if a camera uses fewer bits than its images are stored with."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -10,9 +10,9 @@ from ..errors import MembraneError, expect
 
 FEWEST_BITS, MOST_BITS = 8, 16
 USUAL_BITS = (8, 10, 12, 14)
-"""Numbers of bits of cameras whose values are stored in 16."""
+"""Usual bit depths of cameras whose values are stored in 16 bits."""
 MOST_AVERAGED = 16
-"""Pixels or images whose mean is still recognised as one of whole levels."""
+"""Largest number of averaged pixels or images whose mean is still recognised as a mean of integer levels."""
 HIGHEST = 2**16 - 1
 
 P = ParamSpec("P")
@@ -20,7 +20,7 @@ Found = TypeVar("Found")
 
 
 def check_bits(bits: int | None) -> None:
-    """Refuse a number of bits that no camera has.
+    """Refuse a bit depth that no camera has.
 
     Raises:
         MembraneError: it is not a whole number from 8 to 16.
@@ -38,11 +38,11 @@ values where these are stored in 16, or leave it out
 
 
 def white_of(stored: int, bits: int | None) -> int:
-    """The level that is white.
+    """Return the level that is white.
 
     Args:
-        stored: bits that a value is stored in, 8 or 16.
-        bits: bits of the camera, where 16 hold fewer; None: those it is stored in.
+        stored: number of bits in which a value is stored, 8 or 16.
+        bits: bit depth of the camera, if 16-bit values use fewer bits; None: all stored bits.
 
     Example:
         >>> white_of(16, 12), white_of(16, None), white_of(8, 12)
@@ -52,14 +52,14 @@ def white_of(stored: int, bits: int | None) -> int:
 
 
 def refuse_beyond(highest: Any, white: int) -> None:
-    """Refuse values beyond those of a camera's bits.
+    """Refuse values that exceed the bit depth of the camera.
 
     Args:
-        highest: of the values.
-        white: as for `white_of` gives it.
+        highest: largest value.
+        white: level of white, as `white_of` returns it.
 
     Raises:
-        MembraneError: the highest is beyond white.
+        MembraneError: the largest value exceeds white.
     """
     if int(highest) > white:
         bits = (white + 1).bit_length() - 1
@@ -70,7 +70,7 @@ def refuse_beyond(highest: Any, white: int) -> None:
 
 
 def telling_bits(find: Callable[Concatenate[np.ndarray, P], Found]) -> Callable[Concatenate[np.ndarray, P], Found]:
-    """Decorate a function of an image so that its errors end with the hint of `too_few_bits` on that image."""
+    """Decorate a function of an image so that its errors end with the hint that `too_few_bits` gives for that image."""
 
     @wraps(find)
     def found(image: np.ndarray, /, *args: P.args, **kwargs: P.kwargs) -> Found:
@@ -83,11 +83,11 @@ def telling_bits(find: Callable[Concatenate[np.ndarray, P], Found]) -> Callable[
 
 
 def too_few_bits(image: np.ndarray) -> str:
-    """A hint for the error on an image that shows nothing: how high its values go, if it looks like a camera's fewer bits
-    stored as 16; "" for all other images.
+    """Return a hint for the error on an image without content: how high its values go, if they look like those of a camera of
+    fewer bits stored in 16; return "" for any other image.
 
     Args:
-        image: uint16, or grey in 0..1; also a mean of up to `MOST_AVERAGED` such images or pixels.
+        image: uint16 image, or grey values in 0..1; also a mean of up to `MOST_AVERAGED` such images or pixels.
 
     Example:
         >>> too_few_bits(np.array([[90, 612]], np.uint16))

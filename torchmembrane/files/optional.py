@@ -1,6 +1,7 @@
-"""Optional packages: imported where they are used, with an error that names the extra to install.
+"""Optional packages, imported where they are used.
 
-Each of these functions raises that error if the package is missing, and another one if it is installed but broken.
+If a package is missing, each of these functions raises an error that names the extra to install; if the package is installed
+but cannot be imported, the error says so.
 """
 
 import os
@@ -12,7 +13,7 @@ from .safe_read import in_one_line
 
 
 def load_pyarrow() -> tuple[Any, Any]:
-    """The modules `pyarrow` and `pyarrow.parquet`.
+    """Import and return the modules `pyarrow` and `pyarrow.parquet`.
 
     Raises:
         MembraneError: PyArrow is not installed.
@@ -21,7 +22,7 @@ def load_pyarrow() -> tuple[Any, Any]:
 
 
 def load_pyav() -> Any:
-    """The module `av`.
+    """Import and return the module `av`.
 
     Raises:
         MembraneError: PyAV is not installed.
@@ -30,10 +31,10 @@ def load_pyav() -> Any:
 
 
 def load_opencv(purpose: str = "calibration from boards needs OpenCV") -> Any:
-    """The module `cv2`.
+    """Import and return the module `cv2`.
 
     Args:
-        purpose: what it is needed for, as an error says it.
+        purpose: what the package is needed for, as the beginning of an error message.
 
     Raises:
         MembraneError: OpenCV is not installed.
@@ -47,10 +48,10 @@ def load_opencv(purpose: str = "calibration from boards needs OpenCV") -> Any:
 
 
 def load_edge() -> Any:
-    """The module `torchmembrane_edge`.
+    """Import and return the module `torchmembrane_edge`.
 
     Raises:
-        MembraneError: it is not installed: it comes with this project's repository, in `export/`.
+        MembraneError: torchmembrane-edge is not installed; it is in `export/` of this project's repository.
     """
     try:
         return import_module("torchmembrane_edge")
@@ -61,7 +62,7 @@ def load_edge() -> Any:
 
 
 def load_pandas() -> Any:
-    """The module `pandas`.
+    """Import and return the module `pandas`.
 
     Raises:
         MembraneError: pandas is not installed.
@@ -70,7 +71,7 @@ def load_pandas() -> Any:
 
 
 def load_ray() -> Any:
-    """The module `ray`, with `ray.data`.
+    """Import and return the module `ray`, with `ray.data`.
 
     Raises:
         MembraneError: Ray is not installed.
@@ -81,7 +82,7 @@ def load_ray() -> Any:
 
 
 def load_rerun() -> Any:
-    """The module `rerun`.
+    """Import and return the module `rerun`.
 
     Raises:
         MembraneError: Rerun is not installed.
@@ -90,7 +91,7 @@ def load_rerun() -> Any:
 
 
 def load_rosbags() -> Any:
-    """The module `rosbags.highlevel`.
+    """Import and return the module `rosbags.highlevel`.
 
     Raises:
         MembraneError: rosbags is not installed.

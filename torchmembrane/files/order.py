@@ -1,4 +1,4 @@
-"""The order of frames by their names, and a warning if their times have another order."""
+"""The order of frames by their names, and a warning if their times are in another order."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -10,11 +10,11 @@ from ..user_warnings import warn_user
 Item = TypeVar("Item")
 NUMBER = re.compile("([0-9]+)")
 APART = 1.0
-"""Seconds: files of which one is older by less may have been written at once, as copies are."""
+"""Smallest difference of file times in seconds that counts: copied files may all have been written at about the same time."""
 
 
 def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
-    """A key that sorts names or paths with their numbers by value; leading zeros do not matter.
+    """Return a sort key for names or paths in which numbers are compared by value, without regard to leading zeros.
 
     Example:
         >>> sorted(["f_10", "f_2", "f_1", "e_11"], key=in_order)
@@ -26,7 +26,7 @@ def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """At most `most` of the items, evenly chosen, with the first and the last.
+    """Return at most `most` of the items, evenly spaced, with the first and the last.
 
     Example:
         >>> evenly("abcdefg", 3), evenly("ab", 3)
@@ -39,10 +39,10 @@ def evenly(items: Sequence[Item], most: int) -> list[Item]:
 
 
 def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:
-    """Warn if frames that are used in the order of their names were taken in another order.
+    """Warn if frames that are used in the order of their names were taken in a different order.
 
     Args:
-        frames: name and time (s) of each, in the order in which they are used.
+        frames: name and time (s) of each frame, in the order in which they are used.
 
     Example:
         >>> warn_of_times([("f_9", 100.0), ("f_10", 103.0), ("f_11", 102.5)])  # too little apart to tell
@@ -60,5 +60,5 @@ def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:
 
 
 def warn_of_file_times(paths: Iterable[Path]) -> None:
-    """The same with the times of the files' last changes; missing files are ignored."""
+    """Warn as `warn_of_times` does, by the modification times of files; missing files are ignored."""
     warn_of_times((path.name, path.stat().st_mtime) for path in paths if path.exists())

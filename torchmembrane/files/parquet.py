@@ -11,22 +11,22 @@ from .optional import load_pyarrow
 from .safe_read import DAMAGE, in_one_line, regular_size
 
 MOST_BYTES = 2**30
-"""Largest file, and largest size in memory of the columns that are read."""
+"""Largest size in bytes of a file, and of the columns read from it in memory."""
 VALUE_BYTES = 8
-"""Largest size of one value."""
+"""Largest size of one value in bytes."""
 
 
 def read_table(path: Path, what: str, expected: str, columns: Sequence[str] | None = None) -> Any:
-    """A Parquet file as a `pyarrow.Table`; checksums, where it has them, are compared.
+    """Read a Parquet file as a `pyarrow.Table`; checksums are verified if the file has them.
 
     Args:
         path: path of the file.
-        what: is read, for messages.
-        expected: the remedy, for messages.
-        columns: the ones that are read; None: all.
+        what: what is read, for messages.
+        expected: what is expected, for messages.
+        columns: names of the columns to read; None: all.
 
     Raises:
-        FileNotFoundError: there is none.
+        FileNotFoundError: the file does not exist.
         MembraneError: PyArrow is not installed; the file is damaged, too large, or lacks a column.
     """
     arrow, parquet = load_pyarrow()
@@ -47,7 +47,7 @@ def read_table(path: Path, what: str, expected: str, columns: Sequence[str] | No
 
 
 def nested(values: np.ndarray) -> Any:
-    """Arrays `[rows, ...]` as a column of nested lists of fixed sizes.
+    """Convert an array `[rows, ...]` to a column of nested lists of fixed sizes.
 
     Raises:
         MembraneError: PyArrow is not installed.
@@ -64,13 +64,13 @@ def nested(values: np.ndarray) -> Any:
 
 
 def refusal(path: Path, what: str, expected: str, error: object) -> MembraneError:
-    """The error for a file that is not what it should be."""
+    """Return the error for a file that is not what it should be."""
     cause = in_one_line(str(error).removeprefix(f"{path}: "))
     return MembraneError(f"{path}: not {what}, or damaged ({cause}); expected {expected}")
 
 
 def _declared_bytes(metadata: Any) -> int:
-    """The memory that all columns take, as the file's footer declares; reading the entry of one column of a damaged file may
-    end the process."""
+    """Return the memory of all columns as declared in the file's footer; reading the metadata of a single column of a damaged
+    file may crash the process."""
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     return sum(max(group.total_byte_size, group.num_rows * group.num_columns * VALUE_BYTES) for group in groups)

@@ -1,4 +1,4 @@
-"""The source file of a frame and its time, so that a new image under an old name is noticed."""
+"""The source file of a frame and its time; they reveal when a file name holds a new image."""
 
 import hashlib
 from functools import partial
@@ -11,17 +11,17 @@ DIGEST = partial(hashlib.blake2b, digest_size=16)
 
 
 class SourceFile(NamedTuple):
-    """The file of a frame as it was when the frame was reconstructed, and what was measured beside it.
+    """The file of a frame at the time of its reconstruction, and what was measured along with it.
 
-    Of views that have images of their own, a frame has a file for each.
+    If views have images of their own, a frame has one file per view.
 
     Attributes:
-        path: as given, of the first view.
-        file_size: bytes, of all files; -1 where it is not known.
-        file_modified: nanoseconds since 1970, of the file that was modified last; -1 where it is not known.
-        content_hash: BLAKE2b hash of the content of all files, 16 bytes as hexadecimal; "" if it is not known.
-        time: when the frame was taken, seconds, as its name, video, bag or camera says; NaN where it is not known.
-        gauge: pressure across the membrane that a gauge read then, force unit / length unit^2; NaN where none did.
+        path: path as given; for several files, that of the first view.
+        file_size: total size of all files in bytes; -1 if unknown.
+        file_modified: latest modification time of the files, nanoseconds since 1970; -1 if unknown.
+        content_hash: BLAKE2b hash of the content of all files, 16 bytes in hexadecimal; "" if unknown.
+        time: capture time of the frame in seconds, as its name, video, bag or camera states it; NaN if unknown.
+        gauge: pressure across the membrane measured by a gauge at that time, force unit / length unit^2; NaN if there is none.
     """
 
     path: str = ""
@@ -33,10 +33,10 @@ class SourceFile(NamedTuple):
 
     @classmethod
     def from_files(cls, file: Path, *further: Path) -> "SourceFile":
-        """The origin of a file as it is now; `further`: of the other views, in their order.
+        """Return the provenance of a file in its current state; `further`: the files of the other views, in order.
 
         Raises:
-            OSError: one cannot be read.
+            OSError: a file cannot be read.
 
         Example:
             >>> rest, press = (SourceFile.from_files(Path("examples") / name) for name in ("rest.png", "flat_plate.png"))
@@ -53,12 +53,12 @@ class SourceFile(NamedTuple):
 
     @classmethod
     def of_bytes(cls, file: Path, content: bytes) -> "SourceFile":
-        """The origin of a file of which only the content is known."""
+        """Return the provenance of a file of which only the content is known."""
         return cls(printable(str(file)), len(content), content_hash=DIGEST(content).hexdigest(), time=time_in(file.stem))
 
     def is_of(self, *files: Path) -> bool:
-        """Whether a file, or those of all views, have not changed: size and time are compared, and if these differ the hash.
-        True if the hash is not known or a file cannot be read."""
+        """Return whether a file, or the files of all views, are unchanged: size and time are compared first, and the hash if
+        these differ. Return True if the hash is unknown or a file cannot be read."""
         try:
             stats = [file.stat() for file in files]
             size, modified = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
@@ -70,7 +70,7 @@ class SourceFile(NamedTuple):
 
 
 def printable(text: str) -> str:
-    r"""A path's text in UTF-8; bytes that are not valid UTF-8 are escaped.
+    r"""Return a path's text in UTF-8; bytes that are not valid UTF-8 are escaped.
 
     Example:
         >>> printable("caf\udce9.png")

@@ -1,6 +1,7 @@
 """Bounded reading of untrusted files: kind, size and nesting of a file are checked before memory is allocated.
 
-Any fault is a `MembraneError` of one line that names the file. A file may name others only in its own folder or below.
+Any fault raises a `MembraneError` with a one-line message that names the file. A file may refer to other files only in its own
+folder or below.
 """
 
 import io
@@ -22,11 +23,11 @@ from ..errors import MembraneError
 from .atomic import kind_of
 
 MOST_ARRAY_BYTES = 2**26
-"""Largest size of a file of arrays, and of all arrays that are read from it."""
+"""Largest size in bytes of a file of arrays, and of all arrays read from it together."""
 MOST_ARRAYS = 64
-"""In a file."""
+"""Largest number of arrays in a file."""
 NUMBERS, TEXT = "biuf", "U"
-"""Kinds of numpy's types."""
+"""Kind codes of numpy dtypes."""
 NPY_MAGIC = b"\x93NUMPY"
 PLAIN_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 ENTRY_MARK = b"PK\x01\x02"  # begins every entry of a zip file's directory
@@ -38,19 +39,19 @@ DAMAGE = (
 
 
 class LackingArray(MembraneError):
-    """An intact file of arrays lacks one that was asked for."""
+    """Error for an intact file of arrays that lacks a requested array."""
 
 
 def read_bytes(path: Path, most: int, expected: str) -> bytes:
-    """A file's content.
+    """Return the content of a file.
 
     Args:
-        path: a regular file; devices and pipes are not opened.
-        most: bytes that it may hold.
-        expected: what is read, for messages.
+        path: path of a regular file; devices and pipes are not opened.
+        most: largest allowed size in bytes.
+        expected: what the file should be, for messages.
 
     Raises:
-        MembraneError: no such file, no regular one, a larger one, or one that cannot be read.
+        MembraneError: the file is missing, is not a regular file, is too large, or cannot be read.
 
     Example:
         >>> read_bytes(Path("examples/dots.csv"), 10, "dots")
@@ -72,16 +73,16 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
 
 
 def regular_size(path: Path, most: int, expected: str) -> int:
-    """The size of a regular file in bytes; it is not opened.
+    """Return the size of a regular file in bytes, without opening it.
 
     Args:
         path: as for `read_bytes`.
-        most: bytes that it may hold.
-        expected: what is to be read, for messages.
+        most: largest allowed size in bytes.
+        expected: what the file should be, for messages.
 
     Raises:
-        FileNotFoundError: no such file.
-        MembraneError: no regular one, or a larger one.
+        FileNotFoundError: the file does not exist.
+        MembraneError: the path is not a regular file, or the file is too large.
     """
     try:
         found = os.stat(path)
@@ -97,11 +98,11 @@ def regular_size(path: Path, most: int, expected: str) -> int:
 
 
 def read_text(path: Path, most: int, expected: str) -> str:
-    """A file's text: UTF-8, with or without a byte order mark.
+    """Return the text of a UTF-8 file, with or without a byte order mark.
 
     Args:
         path: as for `read_bytes`.
-        most: largest number of bytes that it may hold.
+        most: largest allowed size in bytes.
         expected: what the file should be, for messages.
 
     Raises:
@@ -119,16 +120,16 @@ def read_text(path: Path, most: int, expected: str) -> str:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, expected: str = "an .npz as numpy.savez writes it", kinds: str = NUMBERS
 ) -> dict[str, np.ndarray]:
-    """Arrays from an `.npz`, by name. Sizes are checked before anything is unpacked; nothing is unpickled.
+    """Read arrays from an `.npz` file, by name. Sizes are checked before anything is unpacked; nothing is unpickled.
 
     Args:
         path: path of the file.
-        names: names of the arrays, others that the file may hold are not read; None: all.
-        expected: what is read, for messages.
-        kinds: kinds of types that they may have, `NUMBERS` or `NUMBERS + TEXT`.
+        names: names of the arrays to read; other arrays in the file are ignored; None: all.
+        expected: what the file should be, for messages.
+        kinds: allowed kinds of dtypes, `NUMBERS` or `NUMBERS + TEXT`.
 
     Raises:
-        MembraneError: no such file, a damaged or too large one, or one that lacks an array.
+        MembraneError: the file is missing, damaged or too large, or lacks an array.
 
     Example:
         >>> read_arrays(Path("examples/rest_grid.npz"), ["vertices"])["vertices"].shape
@@ -155,13 +156,13 @@ def read_arrays(
 
 
 def read_array(path: Path) -> np.ndarray:
-    """The array of numbers of an `.npy`, checked as `read_arrays` does.
+    """Read the array of numbers in an `.npy` file, with the checks of `read_arrays`.
 
     Args:
         path: path of the file.
 
     Raises:
-        MembraneError: no such file, or a damaged or too large one.
+        MembraneError: the file is missing, damaged or too large.
     """
     expected = "an array as numpy.save writes it"
     try:
@@ -173,7 +174,7 @@ def read_array(path: Path) -> np.ndarray:
 
 
 def lies_within(name: str) -> bool:
-    """Whether a file name that is written in another file leads into that file's folder or below, on every system.
+    """Return whether a file name found in another file leads into that file's folder or below, on every operating system.
 
     Example:
         >>> [lies_within(name) for name in ("dots.csv", "rest/a.png", "../dots.csv", "/etc/passwd", "C:\\\\dots.csv")]
@@ -197,7 +198,7 @@ def shortened(text: str, most: int = 80) -> str:
 
 
 def in_one_line(text: object) -> str:
-    """A foreign message or content as one line of at most 200 characters.
+    """Return a message or content from elsewhere as one line of at most 200 characters.
 
     Example:
         >>> in_one_line("unexpected\\n  end\\a")
@@ -207,7 +208,7 @@ def in_one_line(text: object) -> str:
 
 
 def printable(text: object) -> str:
-    """Text with `?` in place of characters that cannot be printed in a line.
+    """Return the text with `?` in place of characters that cannot be printed within a line.
 
     Example:
         >>> printable("rest\\n.png")
@@ -226,7 +227,7 @@ def _refuse_large(size: int) -> None:
 
 
 def _unpacked(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """A member's content, which must have the size and the checksum that the directory declares."""
+    """Return the content of an archive member, which must have the size and checksum declared in the archive's directory."""
     if member.compress_type not in PLAIN_METHODS:
         raise ValueError(f"{member.filename} is compressed by method {member.compress_type}, not deflated")
     with file.open(member) as stream:
@@ -237,7 +238,7 @@ def _unpacked(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 
 def _array(content: bytes, name: str, kinds: str) -> np.ndarray:
-    """The array of an `.npy` file's content, which must hold as many bytes as its header declares."""
+    """Return the array in the content of an `.npy` file, which must have exactly the size that its header declares."""
     if not content.startswith(NPY_MAGIC):
         raise ValueError("it does not begin as an .npy does")
     stream = io.BytesIO(content)
@@ -252,7 +253,7 @@ def _array(content: bytes, name: str, kinds: str) -> np.ndarray:
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether the order is Fortran's, and type."""
+    """Return the shape, whether the order is Fortran's, and the dtype from the header of an `.npy` file."""
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
         return np.lib.format.read_array_header_1_0(stream)

@@ -17,19 +17,19 @@ def refuse_overwriting(
 ) -> None:
     """Refuse to overwrite existing files.
 
-    A file that the command reads is never overwritten. A file that an earlier run of the same command made, according to
-    `is_own`, is overwritten; all others only with `force`. A symbolic link counts as the file that it names if that is read,
-    else as a file of its own.
+    A file that the command reads is never overwritten. A file that, according to `is_own`, an earlier run of the same command
+    created is overwritten; any other file only with `force`. A symbolic link is treated as its target if the target is read,
+    otherwise as a separate file.
 
     Args:
-        command: as messages begin.
-        targets: the files that the command is going to write.
-        read: the files that it reads.
+        command: name of the command, with which messages begin.
+        targets: files that the command is going to write.
+        read: files that the command reads.
         force: whether the user allows other files to be overwritten.
-        is_own: whether this command may overwrite an existing file without `force`.
+        is_own: function that returns whether this command may overwrite an existing file without `force`.
 
     Raises:
-        MembraneError: names the first file that would be lost, or cannot be written at all, and the remedy.
+        MembraneError: a file would be lost, or cannot be written at all; the message names the first such file and the remedy.
 
     Example:
         >>> refuse_overwriting("export", ["examples/sensor.toml"], read=["examples/sensor.toml"], force=True)
@@ -57,7 +57,7 @@ def _is_there(path: Path) -> bool:
 
 
 def _identity(path: Path) -> object:
-    """The same for all names of one file."""
+    """Return a key that is equal for all names of one file."""
     try:
         found = os.stat(path)
     except OSError:

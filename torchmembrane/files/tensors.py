@@ -1,4 +1,4 @@
-"""Conversion of the numbers that callers pass to tensors."""
+"""Conversion of numbers passed by callers to tensors."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ from ..errors import MembraneError, is_number
 
 
 def tensor_of(name: str, values: Any) -> Tensor:
-    """Real numbers as a tensor; torch's default type has no influence.
+    """Convert real numbers to a tensor, independently of torch's default dtype.
 
     Args:
-        name: what an error calls them.
+        name: name of the numbers in error messages.
         values: a tensor, an array, a number, or lists of numbers.
 
     Raises:
-        MembraneError: they are no numbers, or complex ones.
+        MembraneError: the values are not numbers, or are complex.
 
     Example:
         >>> tensor_of("pressure", 0.1).dtype

@@ -1,4 +1,4 @@
-"""Damage of TIFF files that decoders ignore: wrong checksums, displaced pixels, compressed data that are too long."""
+"""Detection of TIFF damage that decoders ignore: wrong checksums, displaced pixels, compressed data that are too long."""
 
 import re
 import struct
@@ -11,17 +11,17 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT, BITS, COMPRESSION, COLOURS, FILL_ORDER, ROWS, PLANES = 256, 257, 258, 259, 262, 266, 278, 284
 PLACES, LENGTHS, TILE = (273, 324), (279, 325), (322, 323)
-"""Tags: of the page, and of its strips or tiles."""
+"""Tag numbers of a page, and of its strips or tiles."""
 UNCOMPRESSED, DEFLATED, LZW, PACKBITS, REVERSED, SUBSAMPLED, APART = 1, (8, 32946), 5, 32773, 2, 6, 2
-"""Values of these tags."""
+"""Values of the tags above."""
 CLEAR, END, MOST_CODES = 256, 257, 4096
-"""Codes of LZW that begin a new table and end the data, and how many a table has."""
+"""LZW codes that begin a new table and end the data, and the largest number of codes in a table."""
 OLD_LZW = re.compile(b"\0[\x01\x03\x05\x07\x09\x0b\x0d\x0f]")
-"""Beginning of data with another order of bits, which are not checked."""
+"""First bytes of LZW data with the old bit order, which is not checked."""
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
-"""Bytes of a value, by its type."""
+"""Size of a value in bytes, by TIFF type."""
 FURTHER = {330, 34665, 34853, 40965}
-"""Tags that lead to further directories, whose data are not looked for."""
+"""Tags that point to further directories; their data are not located."""
 MOST_ENTRIES, MOST_PAGES = 4096, 2**17
 
 
@@ -31,14 +31,14 @@ class _Entry(NamedTuple):
 
 
 def refuse_damaged_page(tags: "ImageFileDirectory_v2", file: IO[bytes]) -> None:
-    """Refuse a page whose compressed data have a wrong checksum or go on after its last pixel, where decoders stop.
+    """Refuse a page whose compressed data have a wrong checksum or continue after its last pixel, where decoders stop.
 
     Args:
         tags: tags of the page.
-        file: that holds it.
+        file: open file that holds the page.
 
     Raises:
-        ValueError: a strip, or a tile, is damaged.
+        ValueError: a strip or tile is damaged.
     """
     compression = tags.get(COMPRESSION)
     sizes = {LZW: _lzw_size, PACKBITS: _packbits_size}
@@ -58,16 +58,16 @@ def refuse_damaged_page(tags: "ImageFileDirectory_v2", file: IO[bytes]) -> None:
 
 
 def refuse_displaced(tags: "ImageFileDirectory_v2", file: IO[bytes]) -> None:
-    """Refuse an uncompressed file of one page with extra bytes at its end: bytes may have been inserted before them.
+    """Refuse an uncompressed single-page file with extra bytes at its end: bytes may have been inserted before them.
 
-    Equal bytes are taken for padding.
+    Extra bytes that are all equal are treated as padding.
 
     Args:
         tags: tags of the page.
-        file: that holds it.
+        file: open file that holds the page.
 
     Raises:
-        ValueError: there are such bytes.
+        ValueError: the file has such bytes.
     """
     if tags.get(COMPRESSION) != UNCOMPRESSED:
         return
@@ -86,13 +86,13 @@ def refuse_displaced(tags: "ImageFileDirectory_v2", file: IO[bytes]) -> None:
 
 
 def _data(tags: "ImageFileDirectory_v2") -> list[tuple[int, int]]:
-    """Offset and length of each strip or tile; an empty list if the file does not state the lengths."""
+    """Return offset and length of each strip or tile; an empty list if the file does not state the lengths."""
     places, lengths = (next((tags[tag] for tag in pair if tag in tags), ()) for pair in (PLACES, LENGTHS))
     return list(zip(places, lengths, strict=False))
 
 
 def _sizes(tags: "ImageFileDirectory_v2", number: int) -> tuple[int, ...]:
-    """The number of bytes to which a strip or a tile may unpack; the last strip may be as long as the others."""
+    """Return the size in bytes to which each strip or tile may unpack; the last strip may be as long as the others."""
     bits = tags.get(BITS, (1,))[: 1 if tags.get(PLANES) == APART else None]
     if TILE[0] in tags:
         width, rows, left = tags[TILE[0]], tags[TILE[1]], tags[TILE[1]]
@@ -105,7 +105,7 @@ def _sizes(tags: "ImageFileDirectory_v2", number: int) -> tuple[int, ...]:
 
 
 def _lzw_size(data: bytes) -> int:
-    """The number of bytes to which LZW data of a TIFF unpack, up to their end code."""
+    """Return the number of bytes to which the LZW data of a TIFF unpack, up to their end code."""
     sizes, before, total, width, held, have = [1] * CLEAR + [0, 0], 0, 0, 9, 0, 0
     for byte in data:
         held, have = (held << 8 | byte) & 0xFFFFF, have + 8
@@ -130,7 +130,7 @@ def _lzw_size(data: bytes) -> int:
 
 
 def _packbits_size(data: bytes) -> int:
-    """The number of bytes to which PackBits data unpack."""
+    """Return the number of bytes to which PackBits data unpack."""
     at = total = 0
     while at < len(data):
         head = data[at]
@@ -142,7 +142,7 @@ def _packbits_size(data: bytes) -> int:
 
 
 def _entries(file: IO[bytes]) -> Iterator[_Entry]:
-    """All entries of all directories, each with the offset where it or its values end in the file."""
+    """Yield all entries of all directories, each with the file offset at which the entry or its values end."""
     file.seek(0)
     head = file.read(16)
     order, big = "<" if head[:2] == b"II" else ">", head[2:4] in (b"+\0", b"\0+")

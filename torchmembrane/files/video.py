@@ -1,4 +1,4 @@
-"""Videos decoded by PyAV, with any file name, also if they are damaged or cut off."""
+"""Decoding of videos with PyAV, under any file name, including damaged and truncated files."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,16 +16,16 @@ from .video_end import missing_end
 Said = TypeVar("Said", int, float)
 
 GREY_OF_16 = ("gray16le", "gray16be")
-"""Formats of pictures, as FFmpeg calls them."""
+"""FFmpeg's names of the 16-bit grey pixel formats."""
 NOT_WHOLE = "it, or one that it is coded by, is not whole"
 TIMED = "matroska"
-"""The format, as FFmpeg calls it, that tells a film's duration at its beginning, and no number of frames."""
+"""FFmpeg's name of the container format that states a duration at its beginning, but no number of frames."""
 WHOLE = 0.01
-"""By how much duration times rate may be off a number of frames."""
+"""Largest difference between duration times rate and a whole number of frames."""
 
 
 def ffmpeg_name(path: Path) -> str:
-    """A file's name for FFmpeg, which would read the text before a colon as a protocol.
+    """Return a file name for FFmpeg, which would read the text before a colon as a protocol.
 
     Example:
         >>> ffmpeg_name(Path("12:30:05.mp4"))
@@ -35,20 +35,20 @@ def ffmpeg_name(path: Path) -> str:
 
 
 def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
-    """The pictures of a video one after another, as PyAV gives them; in place of a damaged one, the error.
+    """Yield the pictures of a video one by one as PyAV decodes them; for a damaged picture, yield the error instead.
 
     The pictures after a damaged one count as damaged too, up to the next key frame.
 
     Args:
         path: path of the video.
-        size: width and height that they must have, px.
+        size: required width and height, px.
 
     Yields:
         `av.VideoFrame`, or a `MembraneError` that does not name the file.
 
     Raises:
-        MembraneError: PyAV is not installed; the file is not a video, has another size, or ends early; the message then says
-            how many frames it holds and should hold.
+        MembraneError: PyAV is not installed; the file is not a video, has another size, or ends early; in the last case the
+            message states how many frames the file holds and should hold.
     """
     av, number, damage = load_pyav(), 0, ""
     with _opened(path) as (container, stream):
@@ -76,14 +76,14 @@ def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
 
 
 def picture_values(picture: Any, bits: int | None = None) -> np.ndarray:
-    """A picture's values: RGB `[height, width, 3]` uint8; of a video of 16-bit grey `[height, width]` in 0..1.
+    """Return the values of a picture: RGB `[height, width, 3]` uint8; for 16-bit grey video `[height, width]` in 0..1.
 
     Args:
-        picture: picture of a video, as PyAV gives it.
-        bits: bits of the camera, where 16 hold fewer.
+        picture: picture of a video, as decoded by PyAV.
+        bits: bit depth of the camera, if 16-bit values use fewer bits.
 
     Raises:
-        MembraneError: values beyond `bits`.
+        MembraneError: a value exceeds `bits`.
     """
     if picture.format.name in GREY_OF_16:
         return to_grey(picture.to_ndarray(), bits)
@@ -92,7 +92,7 @@ def picture_values(picture: Any, bits: int | None = None) -> np.ndarray:
 
 
 def picture_rate(path: Path) -> float | None:
-    """The average frame rate that a video declares; None if it declares none or is no video.
+    """Return the average frame rate that a video declares; None if it declares none or is not a video.
 
     Raises:
         MembraneError: PyAV is not installed.
@@ -101,7 +101,7 @@ def picture_rate(path: Path) -> float | None:
 
 
 def picture_total(path: Path) -> int | None:
-    """The number of pictures that a video declares; None if it declares none or is no video.
+    """Return the number of pictures that a video declares; None if it declares none or is not a video.
 
     Raises:
         MembraneError: PyAV is not installed.
@@ -110,7 +110,7 @@ def picture_total(path: Path) -> int | None:
 
 
 def _said(path: Path, of: Callable[[Any], Said | None]) -> Said | None:
-    """A property that a video declares; None for a file that is no video."""
+    """Return a property that a video declares; None if the file is not a video."""
     load_pyav()
     try:
         with _opened(path) as (_, stream):
@@ -121,7 +121,7 @@ def _said(path: Path, of: Callable[[Any], Said | None]) -> Said | None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """A video and its stream of pictures."""
+    """Open a video; yield it and its video stream."""
     av, expected = load_pyav(), "expected a video that FFmpeg decodes"
     if not path.is_file():
         raise MembraneError(f"no such file; {expected}")
@@ -136,7 +136,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _stream(container: Any) -> Any:
-    """The first stream of pictures that is more than the cover of a sound file."""
+    """Return the first video stream that is not merely the cover image of an audio file."""
     streams = container.streams.video
     moving = [stream for stream in streams if not stream.disposition & type(stream.disposition).attached_pic]
     if not moving:
@@ -155,7 +155,7 @@ def _refuse_size(pictures: Any, size: tuple[int, int]) -> None:
 
 
 def _of_how_many(found: int, container: Any, stream: Any) -> str:
-    """In words, how many pictures a video should have, if it declares more than were found."""
+    """Return the number of pictures that a video should have, in words, if it declares more than were found."""
     told = stream.frames
     if not told and TIMED in container.format.name and container.duration and stream.average_rate:
         told = container.duration / 1e6 * float(stream.average_rate)

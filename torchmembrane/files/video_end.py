@@ -1,22 +1,22 @@
-"""Whether a video file is as long as it declares: Matroska, WebM, AVI, MP4, MOV and GIF."""
+"""Check whether a video file is as long as it declares: Matroska, WebM, AVI, MP4, MOV and GIF."""
 
 from pathlib import Path
 from typing import BinaryIO
 
 EBML, SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
-"""Identifiers of a Matroska file's header, and of the part behind it that is all the rest."""
+"""Identifiers of a Matroska file's header, and of the segment after it, which is the rest of the file."""
 BOXES = (b"ftyp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip")
-"""Boxes with which an MP4 or MOV file may begin."""
+"""Types of the boxes with which an MP4 or MOV file may begin."""
 FRAGMENT = b"moof"
 INDEX = (b"moov", FRAGMENT)
 MOST_BOXES = 2**16
 """Largest number of boxes that are read."""
 LONGEST_TAIL = 1024
-"""Bytes, zeros as a rule, that some programs leave behind the end of a GIF."""
+"""Largest number of bytes, usually zeros, that programs append after the end of a GIF."""
 
 
 def missing_end(path: Path) -> str:
-    """In words, what is missing at the end of a video file; "" if nothing is, or if that cannot be told.
+    """Return in words what is missing at the end of a video file; "" if nothing is missing or this cannot be determined.
 
     Args:
         path: path of a regular file.
@@ -61,7 +61,7 @@ def _end_of_matroska(file: BinaryIO) -> int:
 
 
 def _variable(file: BinaryIO) -> int | None:
-    """A number of variable length in Matroska, whose first byte gives the length; None: unknown, as in a live recording."""
+    """Read a Matroska variable-length number, whose first byte gives the length; None: unknown, as in a live recording."""
     first = file.read(1)
     count = 9 - first[0].bit_length() if first and first[0] else 0
     rest = file.read(count - 1) if count else b""
@@ -89,7 +89,7 @@ def _end_of_riff(file: BinaryIO, held: int) -> int:
 
 
 def _end_of_boxes(file: BinaryIO, held: int) -> tuple[int, set[bytes]]:
-    """Where the boxes of an MP4 or MOV file end, and their kinds."""
+    """Return the offset at which the boxes of an MP4 or MOV file end, and the types of the boxes."""
     at, kinds = 0, set[bytes]()
     for _ in range(MOST_BOXES):
         file.seek(at)

@@ -1,1 +1,1 @@
-"""Other programs' formats and viewers, each an extra."""
+"""Formats and viewers of other programs, each installed as an extra."""

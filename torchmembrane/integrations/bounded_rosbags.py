@@ -1,7 +1,7 @@
-"""The package rosbags within bounds: how large what a bag unpacks to is, before memory and time are taken.
+"""The package rosbags with bounds: the unpacked size of a bag is checked before memory and time are spent.
 
-What is put in here in place of rosbags' own is private to it, and may change with any of its versions: `tests/test_rosbag.py`
-says what has changed.
+This module replaces private parts of rosbags, which may change with any of its versions; `tests/test_rosbag.py` states what has
+changed.
 """
 
 import os
@@ -14,20 +14,21 @@ from typing import Any
 from ..files.optional import load_rosbags
 
 MOST_CHUNK_BYTES = 2**28
-"""Largest size of an unpacked chunk of MCAP, or of a message."""
+"""Largest size in bytes of an unpacked MCAP chunk, or of a message."""
 MOST_RATIO = 256
-"""Bytes that all chunks or a compressed file may unpack to, over those of the file, where they are more than a chunk's."""
+"""Largest ratio of unpacked to packed size, for all chunks or a compressed file; smaller sizes than one chunk are always
+allowed."""
 WINDOW = 28
-"""Logarithm of the memory that zstd may take beside that."""
+"""Base-2 logarithm of the additional memory in bytes that zstd may use."""
 MOST_EVENTS = 2**16
-"""Values, lists and tables of a text in YAML, and their ends."""
+"""Largest number of YAML parser events: values, and beginnings and ends of lists and tables."""
 DEEPEST = 16
-"""Lists and tables of it within one another."""
+"""Largest nesting depth of lists and tables in YAML."""
 
 
 @cache
 def bounded_rosbags() -> Any:
-    """The module `rosbags.highlevel`, which from now on unpacks within bounds, whoever uses it.
+    """Return the module `rosbags.highlevel`, patched for the whole process to unpack within bounds.
 
     Raises:
         MembraneError: rosbags is not installed.
@@ -44,10 +45,10 @@ def bounded_rosbags() -> Any:
 
 
 def refuse_large(reader: Any) -> None:
-    """Refuse an opened bag whose chunks are together far larger than its files: many of them may be in memory at once.
+    """Refuse an open bag whose chunks unpack to far more than the size of its files, since many may be in memory at once.
 
     Raises:
-        ValueError: says by how much.
+        ValueError: the bag is too large; the message states by how much.
     """
     for each in reader.readers:
         for storage in getattr(each.storage, "storages", [each.storage]):
@@ -61,7 +62,7 @@ def _refuse_packed(size: int, packed: int) -> None:
 
 
 def _unpacked(decompressor: Callable[[], Any], content: bytes, size: int = MOST_CHUNK_BYTES) -> bytes:
-    """What is packed, up to a byte more than the size that is declared: then rosbags refuses it."""
+    """Return unpacked data; refuse a declared size that is too large, and data that unpack to more than that."""
     if size > MOST_CHUNK_BYTES:
         raise ValueError(f"a chunk unpacks to {size} bytes; at most {MOST_CHUNK_BYTES} are read: record it in smaller chunks")
     unpacked: bytes = decompressor().decompress(content, max_length=size + 1)
@@ -75,7 +76,7 @@ def _part(name: str) -> Any:
 
 
 class _BoundedFile:
-    """A compressed storage file, unpacked as it is read: `with _BoundedFile(zstd.open, file, "rb") as unpacked`."""
+    """A compressed storage file, unpacked while it is read: `with _BoundedFile(zstd.open, file, "rb") as unpacked`."""
 
     def __init__(self, opened: Callable[..., Any], packed: Any, mode: str):
         self.file, self.packed, self.size = opened(packed, mode), os.fstat(packed.fileno()).st_size, 0
@@ -94,7 +95,7 @@ class _BoundedFile:
 
 
 def _bounded_yaml(yaml: Any) -> Any:
-    """The class `YAML`, whose `load` looks at a text's events before it makes anything of them."""
+    """Return a subclass of `YAML` whose `load` checks the parser events of a text before it builds any objects."""
     from ruamel.yaml import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
     class BoundedYaml(yaml):

@@ -1,4 +1,4 @@
-"""The law of contact pressure over depth for simulators of robots: numbers, the presses behind them, a figure; in SI units."""
+"""Files of the contact-pressure law for robot simulators: coefficients, the presses they were fitted to, a figure; SI units."""
 
 import csv
 import io
@@ -26,15 +26,15 @@ COLUMNS = ("radius", "depth", "simulated_force", "force", "pressure", "held_out"
 
 
 def write_contact_law(law: ContactLaw, sensor: Sensor, folder: str | Path) -> Path:
-    """Write `contact.toml`, `contact.csv` and `contact.png`, in m, N and Pa; forces stay relative where the sensor's are.
+    """Write `contact.toml`, `contact.csv` and `contact.png`, in m, N and Pa; forces stay relative if the sensor's are.
 
     Args:
-        law: law of the sensor.
-        sensor: its tool is the frame of places, else its camera, as in `write_robot_model`.
-        folder: made if it does not exist; files of these names are replaced.
+        law: contact law of the sensor.
+        sensor: sensor; positions are in the frame of its tool, or else of its camera, as in `write_robot_model`.
+        folder: folder of the files; it is created if it does not exist, and files of these names are replaced.
 
     Returns:
-        The folder.
+        The path of the folder.
     """
     folder, metre = make_folder(folder), METRE[law.length_unit]
     pose = sensor.tool or Pose(np.eye(3), np.zeros(3))

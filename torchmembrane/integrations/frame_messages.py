@@ -1,6 +1,6 @@
-"""A frame's result as ROS 2 messages, in N, N m, m and Pa: the same topics, types and fields in bags and live.
+"""A frame's result as ROS 2 messages in N, N m, m and Pa, with the same topics, types and fields in bags and live.
 
-Frames are the camera's: its optical frame, x right, y down, z forward.
+Vectors are in the camera's optical frame: x right, y down, z forward.
 """
 
 from collections.abc import Callable
@@ -23,28 +23,28 @@ TOPICS = {
     "pressure": "sensor_msgs/msg/FluidPressure",
     "status": "diagnostic_msgs/msg/DiagnosticArray",
 }
-"""Types of the messages by the last name of their topic; each of them has a header."""
+"""Message types by the last name of their topic; each message has a header."""
 POINT_FIELDS = ("x", "y", "z", "normal_traction", "shear_x", "shear_y", "shear_z")
-"""Fields of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
+"""Fields of a vertex, each float32: position, m; compressive normal traction and shear traction on the membrane, Pa."""
 CONTACT_FIELDS = ("x", "y", "z", "force_x", "force_y", "force_z", "normal_x", "normal_y", "normal_z", "area")
-"""Fields of a contact, strongest first, each float32: place, m; force on the membrane, N; outward normal; area, m^2."""
+"""Fields of a contact, strongest first, each float32: position, m; force on the membrane, N; outward normal; area, m^2."""
 FLOAT32 = 7
-"""A PointField's datatype."""
+"""PointField's code for float32."""
 GOOD, DOUBTFUL, FAILED = range(3)
 """Levels of a DiagnosticStatus: OK, WARN and ERROR."""
 
 
 class Message(NamedTuple):
-    """A message or a part of one: its type and its fields, which may be messages or lists of them."""
+    """A message or a part of one: its type, and its fields, which may be messages or lists of messages."""
 
     kind: str
     fields: dict[str, Any]
 
     def built(self, make: Callable[..., Any]) -> Any:
-        """The message as a library has it.
+        """Build the message with a library's message classes.
 
         Args:
-            make: called with the type and the fields by name.
+            make: function called with the type and with the fields by name.
 
         Example:
             >>> vector = Message("geometry_msgs/msg/Vector3", {"x": 1.0, "y": 0.0, "z": 0.0})
@@ -61,14 +61,14 @@ def _built(value: Any, make: Callable[..., Any]) -> Any:
 
 
 class SiUnits:
-    """A sensor's results in N, N m, m and Pa.
+    """Conversion of a sensor's results to N, N m, m and Pa.
 
     Args:
         mesh: mesh of the results.
         gas_pressure: `Sensor.gas_pressure`.
 
     Raises:
-        MembraneError: its forces are relative.
+        MembraneError: the forces of the sensor are relative.
     """
 
     def __init__(self, mesh: Mesh, gas_pressure: float | None = None):
@@ -81,14 +81,14 @@ class SiUnits:
         self.gas_pressure = gas_pressure
 
     def topics(self) -> list[str]:
-        """Those of `TOPICS` that this sensor has: a pressure is of a gas."""
+        """Return the names in `TOPICS` that this sensor publishes: `pressure` requires a gas."""
         return [name for name in TOPICS if name != "pressure" or self.gas_pressure is not None]
 
     def messages(self, frame: Frame) -> dict[str, Message]:
-        """A frame's messages by topic, without their header; of a frame without a surface its status alone.
+        """Return a frame's messages by topic, without headers; for a frame without a surface, only its status.
 
         Args:
-            frame: its arrays, as `Reconstruction.frame` gives them.
+            frame: arrays of the frame, as returned by `Reconstruction.frame`.
         """
         found = {"status": _stamped("status", status=[self._status(frame)])}
         if has_wrench(frame):
@@ -103,29 +103,31 @@ class SiUnits:
         return found
 
     def moment(self, frame: Frame) -> np.ndarray:
-        """`[3]` N m about the camera's centre of projection; from the last three of the frame's `wrench [6]`."""
+        """Return the moment about the camera's centre of projection, `[3]` N m, from the last three components of the
+        `wrench [6]`."""
         return frame["wrench"][3:].astype(float) / self.metre
 
     def points(self, frame: Frame) -> np.ndarray:
-        """`[V, 7]` float32: `POINT_FIELDS` of every vertex; from its `vertices`, `normals` and `traction`, `[V, 3]` each."""
+        """Return `POINT_FIELDS` of every vertex, `[V, 7]` float32, from its `vertices`, `normals` and `traction`, `[V, 3]`
+        each."""
         traction, normals = frame["traction"] * self.metre**2, frame["normals"]
         along = (traction * normals).sum(-1, keepdims=True)
         return np.hstack([frame["vertices"] / self.metre, -along, traction - along * normals]).astype(np.float32)
 
     def contacts(self, frame: Frame) -> np.ndarray:
-        """`[n, 10]` float32: `CONTACT_FIELDS` of every contact."""
+        """Return `CONTACT_FIELDS` of every contact, `[n, 10]` float32."""
         area = frame["contact_area"][:, None] / self.metre**2
         each = np.hstack([frame["contact_points"] / self.metre, frame["contact_force"], frame["contact_normal"], area])
         return each[np.isfinite(frame["contact_points"]).all(-1)].astype(np.float32)
 
     def pressure(self, frame: Frame) -> float | None:
-        """Absolute pressure of the gas, Pa, from the frame's `pressure_change []`; None for a sensor without gas."""
+        """Return the absolute gas pressure, Pa, from the frame's `pressure_change []`; None for a sensor without gas."""
         if self.gas_pressure is None:
             return None
         return (self.gas_pressure + float(frame["pressure_change"])) * self.metre**2
 
     def _status(self, frame: Frame) -> Message:
-        """A frame's status in words, and what it was judged by."""
+        """Return a frame's status in words, with the values on which it is based."""
         status = Status(int(frame["status"]))
         values = {
             "status": str(int(status)),
@@ -137,14 +139,14 @@ class SiUnits:
 
 
 def diagnosis(level: int, name: str, text: str, values: dict[str, str]) -> Message:
-    """A `DiagnosticStatus`: `level` is `GOOD`, `DOUBTFUL` or `FAILED`."""
+    """Return a `DiagnosticStatus`; `level` is `GOOD`, `DOUBTFUL` or `FAILED`."""
     pairs = [Message("diagnostic_msgs/msg/KeyValue", {"key": key, "value": value}) for key, value in values.items()]
     fields = {"level": level, "name": name, "message": text, "hardware_id": name, "values": pairs}
     return Message("diagnostic_msgs/msg/DiagnosticStatus", fields)
 
 
 def cloud(points: np.ndarray, names: tuple[str, ...]) -> dict[str, Any]:
-    """Fields of a `sensor_msgs/PointCloud2` of `points [n, len(names)]`, but for its header; `data` are uint8."""
+    """Return the fields of a `sensor_msgs/PointCloud2` of `points [n, len(names)]` without its header; `data` are uint8."""
     step = 4 * len(names)
     fields = [{"name": name, "offset": 4 * k, "datatype": FLOAT32, "count": 1} for k, name in enumerate(names)]
     shape = {"height": 1, "width": len(points), "is_bigendian": False, "point_step": step, "row_step": step * len(points)}
@@ -154,7 +156,7 @@ def cloud(points: np.ndarray, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def has_wrench(frame: Frame) -> bool:
-    """Whether a frame has a surface, and so a wrench."""
+    """Return whether a frame has a surface, and therefore a wrench."""
     return Status(int(frame["status"])).has_surface
 
 

@@ -1,6 +1,6 @@
-"""ROS 2 messages of a camera, and what they say here: images to grey values, lenses compared.
+"""ROS 2 camera messages: conversion of images to grey values, and comparison of lenses.
 
-A message is whatever has the fields of its type, of a bag (rosbags) or of a live system (rclpy).
+A message is any object with the fields of its type, from a bag (rosbags) or a live system (rclpy).
 """
 
 from typing import Any
@@ -24,31 +24,32 @@ CHANNELS: dict[str, tuple[type[np.unsignedinteger[Any]], int, list[int]]] = {
     **{"yuv422_yuy2": (np.uint8, 2, [0]), "yuyv": (np.uint8, 2, [0])},
     **{"yuv422": (np.uint8, 2, [1]), "uyvy": (np.uint8, 2, [1])},
 }
-"""For each encoding: the type of a value, values of a pixel, and which of them are grey, or red, green and blue."""
+"""For each encoding: the type of a value, the number of values per pixel, and the indices of grey, or of red, green and
+blue."""
 PLANES = {"nv12": 1.5, "nv21": 1.5, "nv24": 3.0}
-"""Encodings that hold the grey values of all pixels first, then the colours: bytes for each pixel."""
+"""Encodings that store the grey values of all pixels first, then the colours: bytes per pixel."""
 MOSAICS = {f"bayer_{pattern}{bits}": pattern for pattern in PATTERNS for bits in (8, 16)}
-"""Encodings of cameras that see one colour in each pixel: the colours of 2 x 2 pixels."""
+"""Bayer encodings, whose pixels measure one colour each: the colours of 2 x 2 pixels."""
 SAME = 1.0
-"""Pixels, rms over the image: by how much a CameraInfo may see the same ray elsewhere before it is said."""
+"""Largest rms difference over the image, px, between a CameraInfo and the sensor file that is not reported."""
 SAMPLES = 32
-"""Pixels of the image, in each direction, at which that is worked out."""
+"""Number of sample pixels in each direction for this comparison."""
 LENSES = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 
 
 def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.ndarray:
-    """Grey values `[height, width]` in 0..1 of a `sensor_msgs/Image` or `CompressedImage`.
+    """Return the grey values `[height, width]` in 0..1 of a `sensor_msgs/Image` or `CompressedImage`.
 
-    Of YUV the grey value is Y, as `cv_bridge` has it; of a Bayer pattern the colours are interpolated first.
+    For YUV the grey value is Y, as in `cv_bridge`; for a Bayer pattern the colours are interpolated first.
 
     Args:
         message: the message.
-        size: width and height that it must have, px.
-        bits: bits of the camera, where 16 hold fewer.
+        size: required width and height, px.
+        bits: bit depth of the camera, if 16-bit values use fewer bits.
 
     Raises:
-        MembraneError: another size, values beyond `bits`, an encoding without a grey or colour value for every pixel, or a
-            damaged image.
+        MembraneError: the image has another size, values beyond `bits`, an encoding without a grey or colour value for every
+            pixel, or is damaged.
     """
     if not hasattr(message, "encoding"):
         return _grey_of_file(bytes(message.data), message.format, size, bits)
@@ -64,7 +65,7 @@ def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.
 
 
 def _pixels(message: Any, kind: type[np.unsignedinteger[Any]], values: int) -> np.ndarray:
-    """The values `[height, width, values]` of an Image."""
+    """Return the values `[height, width, values]` of an Image."""
     content, height, step = np.frombuffer(bytes(message.data), np.uint8), message.height, message.step
     item = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     line, planes = message.width * values * item.itemsize, PLANES.get(message.encoding, 1.0)
@@ -78,7 +79,7 @@ def _pixels(message: Any, kind: type[np.unsignedinteger[Any]], values: int) -> n
 
 
 def _grey_of_file(content: bytes, form: str, size: tuple[int, int], bits: int | None) -> np.ndarray:
-    """Grey values of a CompressedImage, whose format is "jpeg", "png", or "ENCODING; jpeg compressed ENCODING"."""
+    """Return the grey values of a CompressedImage, whose format is "jpeg", "png", or "ENCODING; jpeg compressed ENCODING"."""
     encoding, _, packing = form.partition(";")
     if "compresseddepth" in form.lower():
         raise MembraneError(f"format {form!r} holds depths; expected an image: name the topic of the camera's images")
@@ -92,10 +93,10 @@ def _grey_of_mosaic(mosaic: np.ndarray, encoding: str) -> np.ndarray:
 
 
 def size_of(message: Any) -> tuple[int, int]:
-    """Width and height of a `sensor_msgs/Image` or `CompressedImage`, px.
+    """Return the width and height of a `sensor_msgs/Image` or `CompressedImage`, px.
 
     Raises:
-        MembraneError: a damaged image.
+        MembraneError: the image is damaged.
     """
     if hasattr(message, "encoding"):
         return message.width, message.height
@@ -104,7 +105,7 @@ def size_of(message: Any) -> tuple[int, int]:
 
 
 def info_topic(topic: str) -> str:
-    """The topic of the CameraInfo beside a topic of images.
+    """Return the CameraInfo topic that belongs to an image topic.
 
     Example:
         >>> info_topic("/finger/image_raw/compressed")
@@ -114,9 +115,10 @@ def info_topic(topic: str) -> str:
 
 
 def mode_of(info: Any) -> Mode:
-    """What the images of a `sensor_msgs/CameraInfo` are of the calibrated ones: `roi`, where it is not all 0, then `binning`.
+    """Return the camera mode of a `sensor_msgs/CameraInfo`: `roi`, unless it is all 0, is cropped first, then `binning`
+    applies.
 
-    `width`, `height` and `k` are of the calibration (REP 104).
+    `width`, `height` and `k` refer to the calibrated image (REP 104).
     """
     roi, binning = getattr(info, "roi", None), (getattr(info, "binning_x", 0) or 1, getattr(info, "binning_y", 0) or 1)
     left, top, width, height = (roi.x_offset, roi.y_offset, roi.width, roi.height) if roi is not None else (0, 0, 0, 0)
@@ -126,12 +128,13 @@ def mode_of(info: Any) -> Mode:
 
 
 def camera_mismatch(info: Any, camera: Camera) -> str | None:
-    """By how many pixels the lens of a `sensor_msgs/CameraInfo` is off the sensor file's, in words.
+    """Return in words by how many pixels the lens of a `sensor_msgs/CameraInfo` differs from the sensor file's.
 
-    None: by no more than `SAME`, or it is not calibrated. Distortion counts, ports do not: a CameraInfo knows none.
+    Return None if the difference is at most `SAME`, or if the CameraInfo is not calibrated. Distortion is included; ports are
+    not, as a CameraInfo does not describe them.
 
     Raises:
-        MembraneError: it is of images of another size.
+        MembraneError: the CameraInfo is for images of another size.
     """
     width, height = camera.image_size
     mode = mode_of(info)
@@ -168,7 +171,7 @@ def camera_mismatch(info: Any, camera: Camera) -> str | None:
 
 
 def projected(info: Any, rays: np.ndarray) -> np.ndarray:
-    """Where the lens of a CameraInfo sees `rays [..., 3]`, `[..., 2]` px of its mode; NaN behind a pinhole."""
+    """Project `rays [..., 3]` with the lens of a CameraInfo to `[..., 2]` px of its mode; NaN behind a pinhole."""
     mode = mode_of(info)
     (f, g), (u, v) = mode.binned_focal, mode.binned_centre
     k = np.concatenate([np.asarray(info.d, float), np.zeros(8)])[:8]

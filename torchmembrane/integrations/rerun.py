@@ -1,4 +1,4 @@
-"""Frames in the viewer Rerun: image with the markers' motion, surface with traction, contacts, wrench and pressure."""
+"""Frames in the Rerun viewer: image with marker motion, surface with traction, contacts, wrench and pressure."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,11 +18,11 @@ from ..surface.topology import rim_loop
 BLUE, VERMILION, GREY, DARK = (0, 114, 178), (213, 94, 0), (184, 184, 184), (60, 60, 60)
 TRACTION_MAP, FIELD_MAP = "Oranges", "viridis"
 LONGEST_TRACTION, LONGEST_FORCE = 0.15, 0.35
-"""Lengths of the arrows of the largest traction and the largest force so far, over the surface's extent."""
+"""Length of the arrows of the largest traction and the largest force so far, relative to the surface's extent."""
 LEAST_TRACTION = 0.1
-"""Smallest traction that gets an arrow, over the largest one so far."""
+"""Smallest traction that gets an arrow, relative to the largest traction so far."""
 LONGER = 5.0
-"""Length of the arrows of the markers' motion, over this motion."""
+"""Length of the arrows of the marker motion, relative to the motion."""
 TINY = 1e-12
 QUALITY = 90
 """JPEG quality of the images."""
@@ -32,14 +32,15 @@ class RerunLog:
     """A Rerun recording of one sensor's frames: `with RerunLog(mesh, "press.rrd") as log`, then `log.add(...)`.
 
     Entities: `camera/image`, with `rest`, `flow` (`LONGER` times as long) and `lost` markers; `surface/now`, coloured by
-    compressive normal traction, with `traction`, `contacts` and `forces`, beside `surface/rest`; the curves `force`, `moment`
-    and `pressure`; `status`, when it changes; of frames that hold them, `fields/stretch` and `fields/tension`, the surface
-    coloured by the larger principal value, and the curves `largest/stretch` and `largest/tension`. Timelines: `frame`, and
-    `time` where it is known. Colours and arrows run to the largest value so far.
+        compressive normal traction, with `traction`, `contacts` and `forces`, beside `surface/rest`; the curves `force`,
+        `moment` and `pressure`; `status`, logged when it changes. Frames that hold fields add `fields/stretch` and
+        `fields/tension`, the surface coloured by the larger principal value, and the curves `largest/stretch` and
+        `largest/tension`. Timelines: `frame`, and `time` if it is known. Colours and arrows are scaled to the largest value so
+        far.
 
     Args:
-        mesh: what the frames share.
-        save: a file `.rrd`; default: the viewer is opened.
+        mesh: data that all frames share.
+        save: path of a `.rrd` file; default: the viewer is opened.
 
     Raises:
         MembraneError: the package rerun-sdk is not installed.
@@ -71,9 +72,9 @@ class RerunLog:
 
         Args:
             number: number of the frame.
-            frame: its arrays, as `Reconstruction.frame` gives them.
+            frame: arrays of the frame, as returned by `Reconstruction.frame`.
             image: its image, `[height, width]` or `[height, width, 3]`, uint8 or in 0..1.
-            time: when it was taken, seconds since 1970.
+            time: capture time, seconds since 1970.
         """
         self._recording.set_time("frame", sequence=number)
         if time is not None:
@@ -141,8 +142,8 @@ class RerunLog:
         )
 
     def _add_fields(self, frame: Frame) -> None:
-        """The surface once more for each field that the frame holds, coloured by the larger principal value, from the frame's
-        least to its largest."""
+        """Log the surface again for each field in the frame, coloured by the larger principal value, from the smallest to the
+        largest in the frame."""
         from matplotlib import colormaps
 
         for name in FIELDS:
@@ -169,7 +170,7 @@ class RerunLog:
         self._log("pressure", self._rr.Scalars([float(frame["pressure_change"])]))
 
     def _larger(self, name: str, sizes: np.ndarray) -> float:
-        """The largest size so far, never zero."""
+        """Update and return the largest size so far, which is never zero."""
         self._largest[name] = max(self._largest[name], float(sizes.max(initial=0.0)))
         return self._largest[name] or 1.0
 

@@ -1,4 +1,4 @@
-"""A sensor as a part of a robot in simulators: URDF and MJCF with meshes of the membrane at rest and of its rim."""
+"""A sensor as a robot part for simulators: URDF and MJCF with meshes of the rest membrane and of its rim."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,29 +12,29 @@ from ..sensor.units import METRE
 from ..surface.topology import rim_loop
 
 RIM_WIDTH = 0.02
-"""Radius of the tube that is drawn along the rim, over the membrane's extent."""
+"""Radius of the tube drawn along the rim, relative to the extent of the membrane."""
 SIDES = 8
 """Number of sides of that tube."""
 OPTICAL_TO_GRAPHICS = np.diag([1.0, -1.0, -1.0])
-"""A camera of MuJoCo looks along its -z, its y is up; the sensor's looks along z, its y is down."""
+"""Rotation to MuJoCo's camera axes (view along -z, y up) from the sensor's (view along z, y down)."""
 
 
 def write_robot_model(sensor: Sensor, folder: str | Path) -> Path:
     """Write `NAME.urdf`, `NAME.xml` (MJCF), `membrane.stl` and `rim.stl`, in metres.
 
-    The root is the frame of the tool where the sensor file has `[tool]`, else the camera's frame, x right, y down, z out of the
-    lens. `NAME_camera` is the camera's frame. The membrane's mesh is closed by a lid across the rim, as simulators compute a
-    mesh's volume; there are no masses, which the sensor file does not say.
+    The root is the frame of the tool if the sensor file has `[tool]`, otherwise the camera's frame (x right, y down, z out of
+    the lens). `NAME_camera` is the camera's frame. The membrane's mesh is closed by a lid across the rim, because simulators
+    compute the volume of a mesh. There are no masses, as the sensor file does not state them.
 
     Args:
-        sensor: any.
-        folder: made if it does not exist; files of these names are replaced.
+        sensor: any sensor.
+        folder: folder of the files; it is created if it does not exist, and files of these names are replaced.
 
     Returns:
-        The folder.
+        The path of the folder.
 
     Limitations:
-        The membrane is rigid, at rest. Of several cameras the first one is written.
+        The membrane is rigid and at rest. Only the first of several cameras is written.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -55,7 +55,8 @@ def write_robot_model(sensor: Sensor, folder: str | Path) -> Path:
 
 
 def closed_membrane(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """The rest surface with a lid across its rim: vertices `[V + 1, 3]`, camera frame, and triangles `[T, 3]`, outwards."""
+    """Return the rest surface with a lid across its rim: vertices `[V + 1, 3]`, camera frame, and outward triangles
+    `[T, 3]`."""
     membrane = sensor.membrane
     rest, triangles = membrane.rest.double().numpy(), membrane.triangles.numpy()
     loop = rim_loop((int(membrane.grid[0]), int(membrane.grid[1])))
@@ -67,7 +68,7 @@ def closed_membrane(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rim_tube(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """A closed tube along the rim: vertices and triangles, as `closed_membrane`."""
+    """Return a closed tube along the rim: vertices and triangles, as in `closed_membrane`."""
     rest, grid = sensor.membrane.rest.double().numpy(), sensor.membrane.grid
     line = rest[rim_loop((int(grid[0]), int(grid[1])))]
     radius = RIM_WIDTH * np.ptp(rest, 0).max()
@@ -87,7 +88,7 @@ def rim_tube(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stl(vertices: np.ndarray, triangles: np.ndarray) -> bytes:
-    """A binary STL file's content."""
+    """Return the content of a binary STL file."""
     corners = vertices[triangles].astype("<f4")
     record = np.zeros(len(triangles), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -97,7 +98,7 @@ def stl(vertices: np.ndarray, triangles: np.ndarray) -> bytes:
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
-    """Angles about fixed x, y, z, rad, as URDF has them: `rotation = Rz(yaw) Ry(pitch) Rx(roll)`."""
+    """Return the angles about the fixed axes x, y, z, rad, as in URDF: `rotation = Rz(yaw) Ry(pitch) Rx(roll)`."""
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
     if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:  # yaw and roll are about one axis: all is given to roll
         return np.array([np.arctan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])

@@ -1,4 +1,5 @@
-"""Bags of ROS 2 (rosbag2: MCAP and sqlite3) by the package rosbags: images read; wrenches, tractions and pressures written."""
+"""ROS 2 bags (rosbag2: MCAP and sqlite3) through the package rosbags: images are read; wrenches, tractions, pressures
+written."""
 
 import os
 import sqlite3
@@ -24,37 +25,37 @@ from .messages import camera_mismatch, info_topic, size_of
 BAGS, ROS_1, METADATA = (".mcap", ".db3"), ".bag", "metadata.yaml"
 MOST_METADATA_BYTES = 2**20
 MOST_BYTES = 2**50
-"""Largest storage file; it is never read as a whole."""
+"""Largest size in bytes of a storage file, which is never read as a whole."""
 MCAP_MARK, SQLITE_MARK, ROS_1_MARK = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG"
-"""The first bytes of a storage file; those of MCAP are its last ones, too."""
+"""The first bytes of storage files; an MCAP file also ends with them."""
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 NAMESPACE = "/torchmembrane"
-"""Namespace of the topics that are written, as of a node of this name."""
+"""Namespace of the written topics, like that of a node of this name."""
 OURS = "torchmembrane reconstruct --bag"
-"""Stands in the metadata of a bag that is written here."""
+"""Mark in the metadata of the bags that this module writes."""
 
 
 class StampedMessage(NamedTuple):
-    """A message, and when it was received, ns."""
+    """A message, and the time of its reception, ns."""
 
     received: int
     message: Any
 
     @property
     def time(self) -> float:
-        """Seconds since 1970 as its header says, or, where that is empty, of its reception."""
+        """Time in the message's header, seconds since 1970, or the time of reception if that is empty."""
         stamp = self.message.header.stamp
         return float(stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * self.received
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is a bag's `metadata.yaml`, which stands for its folder, or a storage file; of ROS 1 too, which is refused."""
+    """Return whether a path is a bag's `metadata.yaml`, which stands for its folder, or a storage file, even one of ROS 1."""
     return path.name == METADATA or path.suffix.lower() in (*BAGS, ROS_1)
 
 
 def metadata_of(folder: Path) -> list[Path]:
-    """The `metadata.yaml` of a bag's folder; none of another folder."""
+    """Return the `metadata.yaml` of a bag's folder; an empty list for any other folder."""
     return [path for path in (folder / METADATA,) if path.is_file()]
 
 
@@ -63,20 +64,20 @@ def _metadata(path: Path) -> str:
 
 
 def is_mcap(bag: Path) -> bool:
-    """Whether a bag is stored as MCAP, not sqlite3."""
+    """Return whether a bag is stored as MCAP rather than sqlite3."""
     stored = bag.parent.iterdir() if bag.name == METADATA else [bag]
     return any(".mcap" in path.suffixes for path in stored)
 
 
 def image_topic(bag: Path, topic: str | None) -> tuple[str, int]:
-    """The topic of a bag's images, and how many there are.
+    """Return the image topic of a bag, and its number of images.
 
     Args:
-        bag: its `metadata.yaml`, or a storage file.
-        topic: the one that is meant; None: the only one.
+        bag: path of its `metadata.yaml`, or of a storage file.
+        topic: the topic to use; None: the only one.
 
     Raises:
-        MembraneError: there is none, or there are several and none is named; or the bag cannot be read.
+        MembraneError: there is no image topic, or there are several and none is named; or the bag cannot be read.
     """
     with _opened(bag) as reader:
         topics, others = Counter[str](), set[str]()
@@ -97,7 +98,7 @@ def image_topic(bag: Path, topic: str | None) -> tuple[str, int]:
 
 
 def messages(bag: Path, topic: str, kinds: tuple[str, ...] = IMAGE_TYPES) -> Iterator[StampedMessage]:
-    """The messages of a topic that are of one of these types, in the order of their reception.
+    """Yield the messages of a topic that have one of these types, in the order of their reception.
 
     Raises:
         MembraneError: the bag cannot be read, or not to its end.
@@ -109,10 +110,10 @@ def messages(bag: Path, topic: str, kinds: tuple[str, ...] = IMAGE_TYPES) -> Ite
 
 
 def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
-    """What the CameraInfo beside an image topic says otherwise than the sensor file, in words; None: nothing.
+    """Return in words how the CameraInfo beside an image topic differs from the sensor file; None if it does not.
 
     Raises:
-        MembraneError: it is of images of another size, and so are the images.
+        MembraneError: the CameraInfo and the images have another size than the sensor file.
     """
     first = next(messages(bag, info_topic(topic), (INFO_TYPE,)), None)
     try:
@@ -127,15 +128,15 @@ def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
 class BagWriter:
     """A bag of results: `with BagWriter("out", units, mcap=True) as bag`, then `bag.add(image, frame)`.
 
-    The messages of every frame on `TOPICS` in `NAMESPACE`, with the image's header and time of reception.
+    Every frame adds its messages on `TOPICS` in `NAMESPACE`, with the header and the time of reception of its image.
 
     Args:
-        path: a folder: new, or of such a bag, which is replaced when the new one is whole.
+        path: path of the folder: new, or that of an earlier bag of results, which is replaced when the new one is complete.
         units: units of the results.
-        mcap: store as MCAP; else as sqlite3.
+        mcap: whether to store as MCAP; otherwise as sqlite3.
 
     Raises:
-        MembraneError: there is something else at the path, or rosbags is not installed.
+        MembraneError: the path holds something else, or rosbags is not installed.
     """
 
     def __init__(self, path: str | Path, units: SiUnits, mcap: bool):
@@ -171,11 +172,11 @@ class BagWriter:
                 self._writer.path.rename(self.path)
 
     def add(self, image: StampedMessage, frame: Frame) -> None:
-        """Write a frame's messages; `written` counts those that have a wrench.
+        """Write a frame's messages; `written` counts the frames that have a wrench.
 
         Args:
-            image: that it was reconstructed from.
-            frame: its result.
+            image: message of the image from which the frame was reconstructed.
+            frame: result of the frame.
         """
         given = image.message.header
         with _writing_bag(self.path):
@@ -197,7 +198,7 @@ class BagWriter:
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether a path is a bag of results, and nothing else is in its folder."""
+    """Return whether a path is a bag of results whose folder holds nothing else."""
     if path.is_symlink() or not any(OURS in _metadata(found) for found in metadata_of(path)):
         return False
     return all(found.name == METADATA or found.suffix in BAGS for found in path.iterdir())
@@ -205,7 +206,7 @@ def _is_ours(path: Path) -> bool:
 
 @contextmanager
 def _writing_bag(path: Path) -> Iterator[None]:
-    """Within, what goes wrong with the disk names the bag."""
+    """Turn file system errors in the block into errors that name the bag."""
     with writing(path):
         try:
             yield
@@ -215,7 +216,7 @@ def _writing_bag(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _opened(bag: Path) -> Iterator[Any]:
-    """A reader of a bag."""
+    """Yield a reader of a bag."""
     if bag.suffix.lower() == ROS_1:
         raise MembraneError(f"{bag}: {_of_ros_1(bag)}")
     if bag.name == METADATA:
@@ -237,7 +238,7 @@ def _opened(bag: Path) -> Iterator[Any]:
 
 
 def _damage(bag: Path) -> str | None:
-    """What is wrong with the files of a bag and the remedy, where their first and last bytes tell it."""
+    """Return what is wrong with a bag's files and the remedy, if their first and last bytes reveal it."""
     files = [each for each in bag.parent.iterdir() if each.suffix in BAGS and each.is_file()] if bag.name == METADATA else [bag]
     for path in files:
         with open(path, "rb") as file:

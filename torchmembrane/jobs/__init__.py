@@ -1,4 +1,4 @@
-"""Jobs: many image files reconstructed to folders of results."""
+"""Jobs: reconstruction of many image files into folders of results."""
 
 from .frame_reconstructor import FrameReconstructor
 

@@ -1,4 +1,4 @@
-"""ROS bags among the inputs of a job: checks of their CameraInfo messages, and a bag of the results."""
+"""ROS bags as inputs of a job: checks of their CameraInfo messages, and a bag of the results."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def bag_remarks(inputs: Inputs, cameras: Sequence[Camera]) -> Iterator[str]:
-    """The differences between the bags' CameraInfo messages and the sensor file.
+    """Yield the differences between the CameraInfo messages of the bags and the sensor file, in words.
 
     Args:
-        inputs: of the job.
-        cameras: of the topics of images.
+        inputs: inputs of the job.
+        cameras: cameras of the image topics.
 
     Raises:
-        MembraneError: a bag cannot be read, it is not clear which of its topics is meant, or it is of images of another size.
+        MembraneError: a bag cannot be read, has several candidate topics, or holds images of another size.
     """
     for path in inputs.bags:
         for topic, camera in zip(inputs.image_topics, cameras, strict=True):
@@ -35,11 +35,11 @@ def bag_remarks(inputs: Inputs, cameras: Sequence[Camera]) -> Iterator[str]:
 
 
 def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstructor", shard: Shard) -> BagWriter:
-    """The path of the bag to which results will be written.
+    """Return the writer of the bag that will receive the results.
 
     Raises:
-        MembraneError: none of the inputs is a bag, only a shard of them is done, the estimator finds no forces or they are
-            relative, or there is something else at the path.
+        MembraneError: none of the inputs is a bag, only a shard of the frames is reconstructed, the estimator finds no forces
+            or only relative ones, or the path holds something else.
     """
     if shard != WHOLE:
         raise MembraneError("--bag with --shard: leave --bag out, and write the bag by one more call when all shards are done")
@@ -51,7 +51,7 @@ def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstru
 
 
 def write_bag(writer: BagWriter, inputs: Inputs, results: Path) -> int:
-    """Write messages of all frames of the bags in a folder of results; returns the number of those with a wrench."""
+    """Write messages for all bag frames that have results in a folder; return the number of frames with a wrench."""
     found = read_results(results)
     names = set(found.names)
     with writer:

@@ -1,5 +1,5 @@
-"""Frames decoded in the background: images, and the pictures of videos, bags and stacks of images, a batch ahead of the one
-that is computed."""
+"""Decoding of frames in the background, one batch ahead of the computation: images, and the pictures of videos, bags and image
+stacks."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,31 +30,32 @@ if TYPE_CHECKING:
 
 DECODERS = 4
 LONGEST_NAME = 251
-"""Bytes of a frame's name, so that there can be a file NAME.npz."""
+"""Largest length of a frame name in bytes, such that a file NAME.npz can exist."""
 
 
 class Loaded(NamedTuple):
-    """A frame's image `[1, 1, height, width]`, or its images of all views `[1, W, ...]`; and why views lack theirs, by name."""
+    """A frame's image `[1, 1, height, width]`, or its images of all views `[1, W, ...]`, and the reason for each missing view,
+    by name."""
 
     image: Tensor
     lacking: Mapping[str, str] = {}
 
 
 Load: TypeAlias = Callable[["Reconstructor"], Loaded]
-"""Gives a frame's image or raises `MembraneError`."""
+"""Function that returns a frame's image or raises `MembraneError`."""
 
 
 class Picture(NamedTuple):
-    """A picture of a file with several: the function that loads its image, and its time in seconds, NaN if it is not known."""
+    """A picture in a file of several: the function that loads its image, and its time in seconds, NaN if unknown."""
 
     load: Load
     time: float = float("nan")
 
 
 class Source(NamedTuple):
-    """A frame still to be decoded: `load(reconstructor)` gives its image or raises `MembraneError`.
+    """A frame to be decoded: `load(reconstructor)` returns its image or raises `MembraneError`.
 
-    Those of image files can be sent to another process.
+    A source that is an image file can be sent to another process.
     """
 
     name: str
@@ -64,7 +65,7 @@ class Source(NamedTuple):
 
 
 class DecodedFrame(NamedTuple):
-    """A frame to reconstruct: its image, as of `Loaded`, or the reason why there is none."""
+    """A frame to reconstruct: its image, as in `Loaded`, or the reason why there is none."""
 
     name: str
     file: Path
@@ -74,12 +75,12 @@ class DecodedFrame(NamedTuple):
     lacking: Mapping[str, str] = {}
 
     def but(self, error: Exception) -> "DecodedFrame":
-        """The same frame without an image, because of an error."""
+        """Return the same frame without an image, with an error as the reason."""
         return self._replace(image=None, reason=str(error).removeprefix(f"{self.file}: "))
 
 
 def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
-    """All frames of the inputs: the images, then the pictures of videos, bags and stacks, which are called STEM_NUMBER."""
+    """Yield all frames of the inputs: first the images, then the pictures of videos, bags and stacks, named STEM_NUMBER."""
     yield from map(source_of, inputs.images)
     sensor = reconstructor.sensor
     for path in inputs.videos:
@@ -90,12 +91,12 @@ def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
 
 
 def source_of(path: Path) -> Source:
-    """The frame of an image file."""
+    """Return the frame of an image file."""
     return Source(frame_name(path), path, partial(_read, path))
 
 
 def decoded(source: Source, reconstructor: "Reconstructor") -> DecodedFrame:
-    """A frame's image, or the reason why there is none."""
+    """Decode a frame: return its image, or the reason why there is none."""
     frame = DecodedFrame(source.name, source.file, None)
     try:
         if len(source.name.encode()) > LONGEST_NAME:
@@ -108,10 +109,10 @@ def decoded(source: Source, reconstructor: "Reconstructor") -> DecodedFrame:
 
 
 def source_file_of(*paths: Path) -> SourceFile:
-    """The origin of a frame in this file, or in those of all views.
+    """Return the provenance of a frame from its file, or from the files of all views.
 
     Raises:
-        MembraneError: one is not a regular file (a pipe would be waited for), or cannot be read.
+        MembraneError: a path is not a regular file (reading a pipe would block), or cannot be read.
     """
     try:
         for path in paths:
@@ -123,15 +124,15 @@ def source_file_of(*paths: Path) -> SourceFile:
 
 
 def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch: int) -> Iterator[list[DecodedFrame]]:
-    """Yield batches of decoded frames, and decode the next one while one is used.
+    """Yield batches of decoded frames, and decode the next batch while the current one is used.
 
     Args:
         sources: frames to decode, in order.
         reconstructor: reconstructor of the sensor.
-        batch: the number of frames in a batch.
+        batch: number of frames in a batch.
 
     Yields:
-        Lists of `batch` frames, the last one shorter.
+        Lists of `batch` frames; the last list may be shorter.
     """
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(DECODERS) as decoders:
 
@@ -145,19 +146,20 @@ def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch:
 
 
 def length_of(path: Path, inputs: Inputs) -> int | None:
-    """The number of frames that a video, bag or stack declares, of views the largest; None if it declares none or is none."""
+    """Return the number of frames that a video, bag or stack declares, for several views the largest; None if it declares none
+    or is not such a file."""
     if is_bag(path):
         return max(image_topic(path, topic)[1] for topic in inputs.image_topics)
     return max((picture_count(file) or picture_total(file) or 0 for file in files_of(path, inputs)), default=0) or None
 
 
 def files_of(path: Path, inputs: Inputs) -> list[Path]:
-    """The files that hold what a file of several pictures shows: of views a video each, of a bag itself."""
+    """Return the files that hold the pictures of an input: one video per view, or the bag itself."""
     return [path] if is_bag(path) else view_files(path, inputs.views)
 
 
 def _there(path: Path, views: Sequence[str]) -> list[Path]:
-    """Those of a frame's image files that there are."""
+    """Return those image files of a frame that exist."""
     return [file for file in view_files(path, views) if file.is_file()] or [path]
 
 
@@ -168,7 +170,7 @@ def _read(path: Path, reconstructor: "Reconstructor") -> Loaded:
 
 
 def _frames(path: Path, pictures: Iterator[Picture], files: Sequence[Path]) -> Iterator[Source]:
-    """The frames of a file with several, one after another; if the file breaks off, its error is the last frame."""
+    """Yield the frames of a file of several pictures; if the file breaks off, the last frame carries the error."""
     number = -1
     try:
         origin = source_file_of(*files)
@@ -182,10 +184,10 @@ def _frames(path: Path, pictures: Iterator[Picture], files: Sequence[Path]) -> I
 
 
 def _pictures(path: Path, topic: str | None, size: tuple[int, int], bits: int | None) -> Iterator[Picture]:
-    """The pictures of a file with several.
+    """Yield the pictures of a file of several.
 
-    In a bag the time is that of the header, or else of the reception; in a video it counts from the beginning, whose time the
-    file name may give.
+    In a bag, the time is that of the header, or else of the reception; in a video, it counts from the beginning, whose absolute
+    time the file name may give.
     """
     if is_bag(path):
         for each in messages(path, image_topic(path, topic)[0]):
@@ -202,7 +204,8 @@ def _pictures(path: Path, topic: str | None, size: tuple[int, int], bits: int | 
 
 
 def _pictures_of_views(path: Path, inputs: Inputs, views: Sequence[View]) -> Iterator[Picture]:
-    """What a bag or the views' videos show, moment by moment; `path`: the bag's, or the first view's video."""
+    """Yield the pictures of a bag or of the views' videos, grouped by time; `path`: path of the bag, or of the first view's
+    video."""
     files = [path] * len(views) if is_bag(path) else view_files(path, inputs.views)
     topics = inputs.topics if is_bag(path) else [None] * len(views)
     each = zip(files, topics, views, strict=True)
@@ -213,7 +216,8 @@ def _pictures_of_views(path: Path, inputs: Inputs, views: Sequence[View]) -> Ite
 
 
 def _timed(pictures: Iterator[Picture]) -> Iterator[TimedPicture[Picture]]:
-    """Pictures with their times, one without at the latest interval after the one before it; an error is the last picture."""
+    """Add times to pictures: a picture without a time is placed one latest interval after its predecessor; an error is the last
+    picture."""
     time, interval = -1.0, 1.0
     try:
         for picture in pictures:
@@ -225,7 +229,7 @@ def _timed(pictures: Iterator[Picture]) -> Iterator[TimedPicture[Picture]]:
 
 
 def _moment(loads: Sequence[Load | None], reconstructor: "Reconstructor") -> Loaded:
-    """The images of a moment, of the views that have one."""
+    """Load the images that belong to one moment, for the views that have one."""
     views, lacking = reconstructor.sensor.views, {}
     images: list[Tensor | None] = []
     for load, view in zip(loads, views, strict=True):
@@ -248,7 +252,7 @@ def _bag_image(message: Any, size: tuple[int, int], bits: int | None, reconstruc
 
 
 def _image(picture: Any, bits: int | None, reconstructor: "Reconstructor") -> Loaded:
-    """The image of a picture: grey values, or what PyAV gives."""
+    """Load the image of a picture, which is an array of grey values or a PyAV frame."""
     of_stack = isinstance(picture, np.ndarray)
     grey = picture if of_stack else to_grey(picture_values(picture, bits))
     return Loaded(torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels))

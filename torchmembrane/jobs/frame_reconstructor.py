@@ -1,4 +1,4 @@
-"""The worker of a job: it turns frames into rows of results, whichever engine distributes the work."""
+"""The worker of a job: it turns frames into rows of results, independently of the engine that distributes the work."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 Gauge: TypeAlias = Mapping[str, float] | Callable[[str, float], float]
-"""Pressures across the membrane that a gauge reads, by the names of frames, or by name and time, s; NaN where there is none."""
+"""Gauge readings of the pressure across the membrane: by frame name, or as a function of name and time (s); NaN: no reading."""
 
 
 class Outcome(NamedTuple):
@@ -41,12 +41,12 @@ class Outcome(NamedTuple):
 
     @property
     def status(self) -> int:
-        """The status of the result, or `UNREADABLE`."""
+        """Return the status of the result, or `UNREADABLE`."""
         return UNREADABLE if self.stored is None else int(self.stored.frame["status"])
 
     @property
     def status_text(self) -> str:
-        """The same in words."""
+        """Return the status in words."""
         return self.reason if self.stored is None else f"{Status(self.status).text}{self.reason}"
 
 
@@ -58,10 +58,9 @@ class FrameReconstructor:
 
     Args:
         reconstructor: reconstructor of the sensor.
-        rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
-        pressure: readings of a gauge by the names of the frames, or a function of name and time (s); units as for
-            `Reconstructor`.
-        fields: fields of the surface that frames hold as well, as of `Reconstructor.fields`: "stretch", "tension".
+        rest_pixels: markers at rest in this recording, `[D, 2]` px; default: those of the sensor's rest image.
+        pressure: gauge readings by frame name, or a function of name and time (s); units as for `Reconstructor`.
+        fields: surface fields to store in the frames, as in `Reconstructor.fields`: "stretch", "tension".
 
     Example:
         >>> from dataclasses import replace
@@ -85,7 +84,7 @@ class FrameReconstructor:
         self.reconstructor, self.rest_pixels, self.pressure, self.fields = reconstructor, rest_pixels, pressure, fields
 
     def on_device(self, device: str) -> "FrameReconstructor":
-        """The same on a device, "cpu" or "cuda"."""
+        """Return a copy on a device, "cpu" or "cuda"."""
         rest_pixels = None if self.rest_pixels is None else self.rest_pixels.to(device)
         return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure, self.fields)
 
@@ -93,16 +92,17 @@ class FrameReconstructor:
         """Reconstruct a batch of rows.
 
         Args:
-            rows: columns of a dict or a `pandas.DataFrame`: `path [B]`, the image files, which also name the frames. They are
-                read here, unless `image [B, ...]` holds decoded images, one a row, as `Reconstructor` takes them, or
-                `bytes [B]` what is in the files.
+            rows: columns of a dict or a `pandas.DataFrame`: `path [B]`, the image files, whose names are the frame names. The
+                files are read here, unless `image [B, ...]` holds the decoded images, one per row, as `Reconstructor` takes
+                them, or `bytes [B]` holds the content of the files.
 
         Returns:
-            Columns of B rows: `name`, `path`, `status`, `status_text`, the arrays of `Reconstruction`, `content_hash`, size
-            and time of the file, `seconds`. A file that gave no image has status -1, the reason as text, and NaN.
+            Columns of B rows: `name`, `path`, `status`, `status_text`, the arrays of `Reconstruction`, `content_hash`, size and
+            modification time of the file, `seconds`. A file without a readable image has status -1, the reason as text, and
+            NaN.
 
         Raises:
-            MembraneError: `rows` has no column `path`, columns of several lengths, or is neither a dict nor a DataFrame.
+            MembraneError: `rows` has no column `path`, has columns of different lengths, or is neither a dict nor a DataFrame.
         """
         outcomes = self.outcomes([self._frame(*row) for row in _rows(rows)])
         stored = [outcome.stored or Stored(self._blank, SourceFile(printable(str(outcome.file)))) for outcome in outcomes]
@@ -112,7 +112,7 @@ class FrameReconstructor:
         return words | found
 
     def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
-        """The outcome of each frame of a batch."""
+        """Return the outcome of each frame of a batch."""
         start = time.perf_counter()
         readable = [frame for frame in group if frame.image is not None]
         frames = iter(self._reconstructed(readable))
@@ -125,7 +125,7 @@ class FrameReconstructor:
         ]
 
     def _outcome(self, frame: DecodedFrame, image: Tensor, stored: Stored) -> Outcome:
-        """A frame's outcome, with what is to be said of its status: which view was left out, or that values are too few."""
+        """Return a frame's outcome, with a remark if a view was left out or if the values are too low."""
         status = Status(int(stored.frame["status"]))
         words = status_in_words(stored.frame, [view.name for view in self.reconstructor.sensor.views], frame.lacking)
         remark = words.removeprefix(status.text) if status.has_surface else too_few_bits(image.cpu().numpy())
@@ -150,7 +150,7 @@ class FrameReconstructor:
             return frame.but(error)
 
     def _grey(self, image: np.ndarray) -> Tensor:
-        """The grey image of a row's, whose first axis may be that of the colours."""
+        """Return the grey image of a row; its first axis may be the colour axis."""
         grey = self.reconstructor.grey(image[None] if image.ndim == 3 else image)
         expect(len(grey) == 1, "image", list(image.shape), "one image a row")
         return grey
@@ -165,7 +165,7 @@ class FrameReconstructor:
                 raise MembraneError(str(error).removeprefix(f"{file.name}: ")) from error
 
     def decoded(self, source: Source) -> DecodedFrame:
-        """A frame's image, or the reason why there is none."""
+        """Decode a frame: return its image, or the reason why there is none."""
         return decoded(source, self.reconstructor)
 
     @torch.no_grad()
@@ -184,18 +184,18 @@ class FrameReconstructor:
         return [results.frame(i) | {name: values[i] for name, values in arrays.items()} for i in range(len(images))]
 
     def _measured(self, frame: DecodedFrame) -> SourceFile:
-        """A frame's origin, with what the gauge read."""
+        """Return a frame's provenance, including the gauge reading."""
         return frame.origin._replace(gauge=float(self._reading(frame.name, frame.origin.time)))
 
     def _reading(self, name: str, time: float) -> float:
-        """What the gauge reads in a frame."""
+        """Return the gauge reading of a frame, or NaN."""
         if callable(self.pressure):
             return self.pressure(name, time)
         return torch.nan if self.pressure is None else self.pressure.get(name, torch.nan)
 
     @cached_property
     def _blank(self) -> Frame:
-        """The empty result of a file whose image could not be read."""
+        """The empty result for a file whose image could not be read."""
         width, height = self.reconstructor.image_size
         channels = max(1, len(self.reconstructor.sensor.views_apart))
         image = torch.zeros(1, channels, height, width).to(self.reconstructor.rest_pixels)
@@ -204,7 +204,7 @@ class FrameReconstructor:
 
 
 def _rows(columns: Any) -> Iterator[tuple[Any, Any, Any]]:
-    """Path, image and content of every row, None of a column that is missing."""
+    """Yield path, image and content of every row; None for a column that is missing."""
     if not (isinstance(columns, Mapping) or (hasattr(columns, "iloc") and hasattr(columns, "columns"))):
         raise MembraneError(
             f"FrameReconstructor: rows are a {_kind(columns)}; expected a dict of arrays or a pandas.DataFrame: in Ray, "
@@ -237,7 +237,7 @@ def _is_column(value: Any) -> bool:
 
 
 def _array(image: Any) -> np.ndarray:
-    """A row's image as an array."""
+    """Return a row's image as an array."""
     try:
         return np.asarray(image)
     except (ValueError, TypeError, RuntimeError) as error:
@@ -245,7 +245,7 @@ def _array(image: Any) -> np.ndarray:
 
 
 def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:
-    """The columns that `FrameReconstructor` returned, converted to one outcome per frame."""
+    """Convert the columns returned by `FrameReconstructor` to one outcome per frame."""
     frames = [dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)]
     outcomes = []
     for frame in frames:

@@ -1,4 +1,4 @@
-"""The inputs of a job: the files, globs and folders of a call, resolved to images, videos, bags and stacks of images in the
+"""The inputs of a job: the files, globs and folders given in a call, resolved to images, videos, bags and image stacks in the
 order of the call."""
 
 import glob
@@ -23,16 +23,17 @@ VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".gif")
 
 
 class Inputs(NamedTuple):
-    """Image and video files in the order of the call.
+    """Image and video files, in the order of the call.
 
     Attributes:
         images: image files.
-        videos: files of several frames: videos, image files of several pictures, and bags, which are their `metadata.yaml`
-            or a storage file.
-        topic: topic of the bags' images; None: the only one.
-        views: names of the views that have images of their own; `images` and the videos that are no bags are the first one's.
-        topics: topics of the bags' images of each of these views.
-        rest: images of the sensor at rest that were in a folder, and are left out.
+        videos: files of several frames: videos, image files of several pictures, and bags, given by their `metadata.yaml` or a
+            storage file.
+        topic: image topic of the bags; None: the only one.
+        views: names of the views that have images of their own; `images`, and the videos that are not bags, are those of the
+            first view.
+        topics: image topic in the bags for each of these views.
+        rest: images of the sensor at rest that were found in a folder and are skipped.
     """
 
     images: list[Path]
@@ -44,7 +45,7 @@ class Inputs(NamedTuple):
 
     @property
     def image_topics(self) -> Sequence[str | None]:
-        """Of the bags' images, of each view."""
+        """Image topics of the bags, one per view."""
         return self.topics or (self.topic,)
 
     @property
@@ -54,11 +55,11 @@ class Inputs(NamedTuple):
 
     @property
     def need_pyav(self) -> bool:
-        """Whether some of the videos are neither bags nor images."""
+        """Whether some of the videos are neither bags nor image files."""
         return any(not is_bag(path) and not picture_count(path, 1) for path in self.videos)
 
     def video_of(self, name: str) -> Path | None:
-        """The video whose frame would have this name, STEM_NUMBER.
+        """Return the video with a frame of this name, STEM_NUMBER, or None.
 
         Example:
             >>> Inputs([], [Path("day/press.mp4")]).video_of("press_000012").name
@@ -69,8 +70,8 @@ class Inputs(NamedTuple):
 
 
 def frame_name(path: Path) -> str:
-    r"""The name of an image's frame, or the first part of the names of a video's: the file's, without its ending, or the
-    bag's folder's, in UTF-8.
+    r"""Return the name of an image's frame, or the prefix of a video's frame names, in UTF-8: the file name without its
+    extension, or the name of a bag's folder.
 
     Example:
         >>> frame_name(Path("day/caf\udce9.png"))
@@ -80,7 +81,7 @@ def frame_name(path: Path) -> str:
 
 
 def picture_name(path: Path, number: int) -> str:
-    """The name of a picture of a video or bag.
+    """Return the name of a picture in a video or bag.
 
     Example:
         >>> picture_name(Path("day/press.mp4"), 12)
@@ -90,20 +91,20 @@ def picture_name(path: Path, number: int) -> str:
 
 
 def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str | None = None) -> Inputs:
-    """Files, globs and folders as files.
+    """Resolve files, globs and folders to files.
 
     Args:
-        arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns. Numbers in
-            names count as numbers: 2 before 10. Hidden files and those that operating systems leave in folders are ignored.
-        video: take every file for a video.
-        topic: topic of the bags' images.
+        arguments: paths of files, folders (their images in name order, or the bag that the folder is) and glob patterns.
+            Numbers in names are sorted by value: 2 before 10. Hidden files and files of operating systems are ignored.
+        video: whether to treat every file as a video.
+        topic: image topic of the bags.
 
     Returns:
-        The files, images and videos each in the order of the call; where that is the plain order of their names, which shells
-        give, in that of the numbers in them.
+        The files, images and videos each in the order of the call; if that is the lexical order of the names, as shells produce
+        it, the files are sorted by the numbers in their names instead.
 
     Raises:
-        MembraneError: an argument names no file, or two frames would have one name.
+        MembraneError: an argument matches no file, or two frames would have the same name.
 
     Example:
         >>> [path.name for path in find_inputs(["examples/*_*.png"]).images]
@@ -132,14 +133,14 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 
 
 def without_rest(inputs: Inputs, arguments: Iterable[str | Path], files: Iterable[Path]) -> Inputs:
-    """Inputs without the sensor's rest images among what folders hold, unless there is nothing else.
+    """Remove the sensor's rest images from the contents of folders, unless nothing else remains.
 
-    `simulate` and calibration write the sensor's rest image beside the others; a file that is given by its own name stays.
+    `simulate` and calibration write the sensor's rest image beside the other images; a file given by its own name is kept.
 
     Args:
-        inputs: as `find_inputs` gives them.
-        arguments: what it was given.
-        files: the sensor's, as of `files_of`.
+        inputs: inputs as returned by `find_inputs`.
+        arguments: the arguments of that call.
+        files: files of the sensor, as returned by `files_of`.
 
     Example:
         >>> found = without_rest(find_inputs(["examples"]), ["examples"], [Path("examples/rest.png")])
@@ -155,17 +156,17 @@ def without_rest(inputs: Inputs, arguments: Iterable[str | Path], files: Iterabl
 
 
 def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = ()) -> Inputs:
-    """Inputs with one image or video for each frame or recording: of views with images of their own, NAME_VIEW.png or
-    NAME_VIEW.mp4, the first view's.
+    """Reduce inputs to one image or video per frame or recording: for views with images of their own, NAME_VIEW.png or
+    NAME_VIEW.mp4, those of the first view are kept.
 
     Args:
-        inputs: as for `find_inputs` gives them.
-        views: names of the sensor's views with images of their own; none of one view, or of regions of one image.
-        topics: of these views' images in bags.
+        inputs: inputs as returned by `find_inputs`.
+        views: names of the sensor's views with images of their own; empty for a single view, or for regions of one image.
+        topics: image topics of these views in bags.
 
     Raises:
-        MembraneError: a file is of none of the views, a frame has no image of the first one, a recording no video of one of
-            them, or a bag no topics.
+        MembraneError: a file belongs to no view, a frame lacks the image of the first view, a recording lacks the video of a
+            view, or a bag is given without topics.
 
     Example:
         >>> both = Inputs([Path("press_left.png"), Path("press_right.png")], [])
@@ -187,7 +188,7 @@ def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = 
 
 
 def _firsts(paths: list[Path], views: Sequence[str]) -> list[Path]:
-    """The first view's files among those of all."""
+    """Return the first view's files among the files of all views."""
     firsts = [path for path in paths if path.stem.endswith(f"_{views[0]}")]
     names = {path.stem.removesuffix(views[0]) for path in firsts}
     for path in paths:
@@ -198,10 +199,10 @@ def _firsts(paths: list[Path], views: Sequence[str]) -> list[Path]:
 
 
 def single_images(inputs: Inputs) -> list[Path]:
-    """The image files of inputs that may only be images with a file each.
+    """Return the image files of inputs that must be images, each in its own file.
 
     Raises:
-        MembraneError: there are files of several pictures among the inputs.
+        MembraneError: the inputs include a file of several pictures.
     """
     if inputs.videos:
         raise MembraneError(f"{inputs.videos[0]}: holds several pictures; expected images here, each as a file of its own")
@@ -226,7 +227,7 @@ def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
 
 
 def _remedy(folder: Path) -> str:
-    """What to give in place of a folder that holds no images."""
+    """Return the remedy for a folder that holds no images."""
     if any(path.suffix.lower() in BAGS for path in folder.iterdir()):
         return f"expected images, or a bag with its {METADATA}, which `ros2 bag reindex {folder.name}` makes: or give its files"
     return "expected one or more"

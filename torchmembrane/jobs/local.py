@@ -1,4 +1,4 @@
-"""The job on one machine: it reconstructs files in batches, can be resumed, and never stops for a bad file."""
+"""The job on one machine: it reconstructs files in batches, can be resumed, and never stops because of a bad file."""
 
 import sys
 from collections import Counter
@@ -28,14 +28,15 @@ if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
 Engine: TypeAlias = Callable[[Work, Iterator[Source], int | None], Iterator[list[Outcome]]]
-"""Computes what becomes of all frames, in batches of a size, by default of its own."""
+"""Function that computes the outcomes of all frames from the work, the sources and the batch size; None: the engine's
+default."""
 
 FEW_FRAMES = 50
-"""A job of fewer frames does not wait for machine code to be compiled."""
+"""Smallest number of frames for which a job waits until machine code is compiled."""
 
 
 class FrameCounts(NamedTuple):
-    """How many frames of a call were reconstructed (some with a status other than ok), failed, or were already finished."""
+    """Numbers of frames in a call: reconstructed (some with a status other than ok), failed, and already finished."""
 
     reconstructed: int
     not_converged: int
@@ -63,27 +64,27 @@ def reconstruct_files(
 ) -> FrameCounts:
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
 
-    A file that cannot be read stands in summary.csv with status -1 and has no result. Interrupted at any point, `out`
-    holds what is done so far and the same call continues from there: at most `SAVE_SECONDS` and a batch are lost. A frame whose
-    image has changed since is done again.
+    A file that cannot be read is listed in summary.csv with status -1 and has no result. If the job is interrupted at any
+    point, `out` holds what was computed so far, and the same call resumes from there: at most `SAVE_SECONDS` and one batch are
+    lost. A frame whose image has changed is reconstructed again.
 
     Args:
-        reconstructor: a `Reconstructor`.
-        inputs: what `find_inputs` gives.
-        out: folder of the results: new, or of the same sensor and settings.
-        settings: what the reconstructor was made with, and the format of the results.
-        batch: frames computed at once; default: by the memory that there is.
-        workers: processes that compute, each with one thread; 1: this process with all of torch's threads; default None: one
-            per core where there are frames enough. A script that asks for more than one needs `if __name__ == "__main__":`.
-        shard: which part of the frames to do; several shards may do theirs at once.
-        engine: what computes, in place of this machine's processes: from work, sources and batch, all outcomes.
-        figures: also NAME.png for every frame; a finished frame that lacks its figure is done again.
-        rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
-        pressure: that a gauge reads, by the names of the frames or by name and time, as `Reconstructor` takes it.
-        report: called with one line per failed frame (default: the line is written to stderr, above the progress bar).
+        reconstructor: reconstructor of the sensor.
+        inputs: inputs as returned by `find_inputs`.
+        out: folder of the results: new, or one with results of the same sensor and settings.
+        settings: settings of the reconstructor, and the format of the results.
+        batch: number of frames computed at once; default: chosen by the available memory.
+        workers: number of worker processes, each with one thread; 1: this process with all of torch's threads; None: one per
+            core if there are enough frames. A script that uses more than one needs `if __name__ == "__main__":`.
+        shard: part of the frames to reconstruct; several shards may run at the same time.
+        engine: function that computes all outcomes from work, sources and batch, in place of the processes of this machine.
+        figures: whether to write NAME.png for every frame; a finished frame without its figure is reconstructed again.
+        rest_pixels: markers at rest in this recording, `[D, 2]` px; default: those of the sensor's rest image.
+        pressure: gauge readings by frame name, or by name and time, in the units of `Reconstructor`.
+        report: function called with one line per failed frame (default: write it to stderr, above the progress bar).
 
     Returns:
-        The numbers of frames.
+        Numbers of reconstructed, failed and skipped frames.
 
     Raises:
         MembraneError: `out` is refused, another job is writing there, or a package for videos or Parquet is missing.
@@ -130,14 +131,13 @@ def reconstruct_files(
 
 
 def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
-    """Whether a job is solved by machine code, from its first frame to its last; a message is printed if the code must be
-    compiled first.
+    """Return whether a job is solved with machine code; print a message if it has too few frames to compile the code.
 
-    A few frames take less time by tensor operations than compiling does.
+    A few frames take less time by tensor operations than the compilation takes.
 
     Args:
         reconstructor: reconstructor of the job.
-        left: its frames; None where that is not known.
+        left: number of frames in the job; None if unknown.
     """
     if not reconstructor.estimator.must_compile or left == 0:
         return True
@@ -150,8 +150,7 @@ def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
 
 
 def _kept(folder: ResultFolder, outcome: Outcome, report: Callable[[str], None]) -> int:
-    """Store an outcome, print the reason if it is not a result, or one of views of which one was left out, and return its
-    status."""
+    """Store an outcome, report its reason if there is no result or a view was left out, and return its status."""
     status = folder.keep(outcome)
     if status not in FINISHED or status == Status.VIEW_LEFT_OUT:
         of_video = "" if outcome.name == frame_name(outcome.file) else f", {outcome.name}"
@@ -160,7 +159,7 @@ def _kept(folder: ResultFolder, outcome: Outcome, report: Callable[[str], None])
 
 
 def _local(reconstructor: "Reconstructor", workers: int | None, left: int) -> Engine:
-    """This process, or worker processes of this machine."""
+    """Return the engine of this machine: this process, or worker processes."""
     device = reconstructor.rest_pixels.device.type
     count = workers_for(left, device) if workers is None else workers
     compute = outcomes_here if count == 1 else partial(outcomes_by, count)
@@ -174,7 +173,7 @@ def _local(reconstructor: "Reconstructor", workers: int | None, left: int) -> En
 
 
 class _Progress:
-    """A bar with rate and counts over all frames of the call, as far as the videos say how many they hold."""
+    """A progress bar with rate and counts for all frames of the call, as far as the videos declare their numbers of frames."""
 
     def __init__(self, inputs: Inputs, shard: Shard, finished: set[str]):
         from tqdm import tqdm
@@ -189,7 +188,7 @@ class _Progress:
         self.bar = tqdm(total=total if all(lengths) else None, initial=self.initial, unit="frame", desc="reconstruct")
 
     def update(self, frames: int, done: Counter[int]) -> None:
-        """Some more frames; `done`: all of this call by status."""
+        """Advance the bar by some frames; `done`: all frames of this call so far, by status."""
         failed = sum(count for status, count in done.items() if status not in FINISHED)
         self.bar.set_postfix({"failed": failed, "not converged": done[Status.NOT_CONVERGED]}, refresh=False)
         self.bar.update(frames)

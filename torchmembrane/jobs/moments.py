@@ -1,4 +1,4 @@
-"""Pictures of several views matched by their times: one frame for each moment."""
+"""Matching of the pictures of several views by their times: one frame per moment."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -8,28 +8,28 @@ from typing import Generic, NamedTuple, TypeVar
 
 Image = TypeVar("Image")
 RECENT = 15
-"""Intervals between pictures of which the median is the usual one."""
+"""Number of latest intervals between pictures whose median is taken as the usual interval."""
 
 
 class TimedPicture(NamedTuple, Generic[Image]):
-    """A picture, and its time in seconds."""
+    """A picture and its time in seconds."""
 
     time: float
     picture: Image
 
 
 def moments(streams: Sequence[Iterator[TimedPicture[Image]]]) -> Iterator[list[TimedPicture[Image] | None]]:
-    """What each view shows at each moment, in the order of time.
+    """Yield the pictures of all views for each moment, in the order of time.
 
-    A moment begins with the earliest picture that is left. Another view's next picture belongs to it where it is at most half
-    as late as the picture that follows the earliest in its own view, or would follow if none was lost: by the median of the
-    latest `RECENT` intervals. Else that view lacks a picture at this moment.
+    A moment begins with the earliest remaining picture. The next picture of another view belongs to the same moment if its
+    delay is at most half the interval to the next picture in the earliest picture's own view; if that picture may have been
+    lost, the interval is the median of the latest `RECENT` intervals. Otherwise that view has no picture at this moment.
 
     Args:
-        streams: of each view its pictures, in the order of time.
+        streams: pictures of each view, in the order of time.
 
     Yields:
-        Of each view its picture, or None.
+        For each view its picture, or None.
 
     Example:
         >>> left, right = ([TimedPicture(time, None) for time in times] for times in ((0.0, 0.1, 0.2), (0.02, 0.21)))
@@ -44,7 +44,7 @@ def moments(streams: Sequence[Iterator[TimedPicture[Image]]]) -> Iterator[list[T
 
 
 class _Queue(Generic[Image]):
-    """A view's pictures, of which the next two are known."""
+    """The pictures of a view, read two ahead."""
 
     def __init__(self, stream: Iterator[TimedPicture[Image]]):
         self._stream, self._intervals = stream, deque[float](maxlen=RECENT)
@@ -54,17 +54,18 @@ class _Queue(Generic[Image]):
 
     @property
     def time(self) -> float:
-        """Of the next picture; infinite where none is left."""
+        """Time of the next picture; infinite if none is left."""
         return inf if self.next is None else self.next.time
 
     @property
     def interval(self) -> float:
-        """From the next picture to the one after it, seconds, or the median of the latest, if that is less."""
+        """Interval from the next picture to the one after it, or the median of the latest intervals if that is shorter,
+        seconds."""
         usual = median(self._intervals) if self._intervals else inf
         return usual if self._after is None else min(usual, self._after.time - self.time)
 
     def taken(self) -> TimedPicture[Image] | None:
-        """The next picture, which is so no more."""
+        """Remove and return the next picture."""
         taken, self.next = self.next, self._after
         self._look_ahead()
         return taken

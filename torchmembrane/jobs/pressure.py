@@ -1,4 +1,4 @@
-"""Pressure readings of a recording: the log of a gauge, by the frames' names or by time."""
+"""Pressure readings of a recording: a gauge's log, by frame name or by time."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -25,22 +25,23 @@ PRESSURES = Columns(
     unit="hPa, across the membrane or since rest; time in seconds, or as 2026-09-27T11:38:29.25",
 )
 UNKNOWN = ("", "nan")
-"""Cells of frames that have no reading."""
+"""Cell contents that mean that a frame has no reading."""
 KINDS = {"name": "frames", "image": "images"}
-"""What the first column of a table may name."""
+"""What the names in the first column of a table refer to."""
 REACH, INTERVALS = 1.0, 1.5
-"""A frame has a reading by time where one is within so many seconds, or intervals between readings if that is more."""
+"""Largest time between a frame and a reading that is used for it: seconds, or multiples of the readings' interval if that is
+longer."""
 
 
 class PressureReadings(NamedTuple):
-    """Readings of a gauge, force unit / length unit^2.
+    """Gauge readings, force unit / length unit^2.
 
     Attributes:
-        values: by the names of the frames; frames without a reading are left out.
-        since_rest: whether these are changes since rest, or differences across the membrane.
-        times: `[T]` seconds, increasing, of readings by time; empty of those by name.
-        series: `[T]`, the readings then.
-        unused: readings that are of no frame of the call, as far as that is known before its videos are read.
+        values: readings by frame name; frames without a reading are left out.
+        since_rest: whether the readings are changes since rest, or differences across the membrane.
+        times: times of the readings, `[T]` seconds, increasing; empty for readings by name.
+        series: readings at these times, `[T]`.
+        unused: readings that belong to no frame of the call, as far as this is known before its videos are read.
     """
 
     values: dict[str, float]
@@ -50,7 +51,7 @@ class PressureReadings(NamedTuple):
     unused: int = 0
 
     def at(self, name: str, time: float) -> float:
-        """The reading of a frame, by its name or between those next to its time, s; NaN where there is none."""
+        """Return the reading of a frame, by its name or interpolated to its time (s); NaN if there is none."""
         if name in self.values or not len(self.times):
             return self.values.get(name, np.nan)
         near = np.isfinite(time) and np.abs(self.times - time).min() <= self.reach
@@ -58,25 +59,25 @@ class PressureReadings(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """The largest time between a frame and a reading that is used for it, s."""
+        """Largest time between a frame and a reading that is used for it, s."""
         return max(REACH, INTERVALS * float(np.median(np.diff(self.times)))) if len(self.times) > 1 else REACH
 
     def plus(self, offset: float) -> "PressureReadings":
-        """The readings with a constant added to each."""
+        """Return the readings with a constant added to each."""
         values = {name: offset + value for name, value in self.values.items()}
         return self._replace(values=values, series=offset + self.series)
 
 
 def recording_pressures(reconstructor: "Reconstructor", path: Path, inputs: Inputs) -> PressureReadings:
-    """The pressures across the membrane that a gauge's log holds, force unit / length unit^2.
+    """Return the pressures across the membrane in a gauge's log, force unit / length unit^2.
 
     Args:
-        reconstructor: the sensor's.
-        path: path of the table, as for `read_pressures`.
+        reconstructor: reconstructor of the sensor.
+        path: path of the table, in the format of `read_pressures`.
         inputs: inputs of the call.
 
     Raises:
-        MembraneError: a pressure tells nothing to this estimator or of this cavity; the sensor has no modulus; the table is not
+        MembraneError: the estimator cannot use a pressure, or not for this cavity; the sensor has no modulus; the table is not
             as expected.
     """
     reconstructor.estimator.check_gauge()
@@ -95,14 +96,14 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
     """Read a gauge's log: `pressure` or `pressure_change` by `name` or by `time`, hPa; 1 hPa = 100 N/m^2.
 
     Args:
-        path: path of the table. A name is that of a frame or of its image file; a value may be left empty, or be nan. The
-            readings of other frames, or at other times, are counted.
-        inputs: the frames.
-        sensor: gives the length unit.
+        path: path of the table. A name is that of a frame or of its image file; a value may be empty or nan. Readings of other
+            frames or at other times are counted as unused.
+        inputs: files of the frames.
+        sensor: sensor; its length unit is used.
 
     Raises:
-        MembraneError: the table cannot be read, or has another header, a name or time twice, no number, or no reading of
-            any frame.
+        MembraneError: the table cannot be read, has another header, a repeated name or time, a value that is not a number, or
+            no reading of any frame.
     """
     table = read_table(path, PRESSURES, MOST_BYTES)
     key, column = table.form
@@ -145,21 +146,21 @@ def _by_time(path: Path, table: Table, inputs: Inputs, one: float, since_rest: b
 
 
 def _time(row: Row) -> float:
-    """The time of a reading, s."""
+    """Return the time of a reading, s."""
     text = row.text(TIME)
     dated = time_in(text)
     return row.number(TIME) if np.isnan(dated) or text.replace(".", "").isdigit() else dated
 
 
 def by_frame(table: Table, inputs: Inputs) -> tuple[dict[str, Row], list[Row]]:
-    """The lines of a table by the names of their frames, and the lines that belong to no frame.
+    """Return the lines of a table by the names of their frames, and the lines that belong to no frame.
 
     Args:
-        table: whose first column holds names of frames, or of their image files.
-        inputs: the frames.
+        table: table whose first column holds names of frames, or of their image files.
+        inputs: files of the frames.
 
     Raises:
-        MembraneError: a name that stands there twice.
+        MembraneError: a name is listed twice.
     """
     column = table.form[0]
     names = [(image.name, frame_name(image)) for image in inputs.images]
@@ -179,7 +180,7 @@ def by_frame(table: Table, inputs: Inputs) -> tuple[dict[str, Row], list[Row]]:
 
 
 def refusal(row: Row, table: Table, inputs: Inputs) -> MembraneError:
-    """The error for a line that belongs to no frame."""
+    """Return the error for a line that belongs to no frame."""
     column = table.form[0]
     names = [image.name for image in inputs.images[:1]] + [f"{frame_name(video)}_000000" for video in inputs.videos[:1]]
     quoted = shortened(repr(row.text(column)))

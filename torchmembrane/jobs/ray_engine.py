@@ -1,4 +1,4 @@
-"""Frames computed by the actors of a Ray cluster: the job's process distributes paths and writes the results."""
+"""Computation of frames by the actors of a Ray cluster; the process of the job distributes paths and writes the results."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,16 +15,16 @@ from .workers import Work, batch_for
 
 
 class RayEngine:
-    """Computes the outcomes of all frames on the cluster that `RAY_ADDRESS` names, or on this machine.
+    """Compute the outcomes of all frames on the cluster that `RAY_ADDRESS` names, or on this machine.
 
     A worker that dies is replaced, and its frames are computed again.
 
     Args:
-        device: device of each worker, "cpu" with one thread, or "cuda" with a GPU of its own.
-        workers: how many; default: as many as the cluster has room for.
+        device: device of each worker: "cpu" with one thread, or "cuda" with a GPU of its own.
+        workers: number of workers; default: as many as fit on the cluster.
 
     Raises:
-        MembraneError: Ray is not installed; on calling: videos or figures are asked for.
+        MembraneError: Ray is not installed; when called: videos or figures are requested.
     """
 
     def __init__(self, device: str = "cpu", workers: int | None = None):

@@ -1,4 +1,4 @@
-"""The rest state of a recording: the markers in its own images without contact."""
+"""The rest state of a recording: the markers in the recording's own images without contact."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -21,15 +21,15 @@ FIRST = "first:"
 
 
 def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs: Inputs) -> Tensor:
-    """The markers at rest, `[D, 2]` px, averaged over images without contact.
+    """Return the marker positions at rest, `[D, 2]` px, averaged over images without contact.
 
     Args:
-        reconstructor: the sensor's.
-        arguments: image files, globs or folders; or `first:N`, the first N frames of the inputs.
+        reconstructor: reconstructor of the sensor.
+        arguments: image files, globs or folders; or `first:N` for the first N frames of the inputs.
         inputs: inputs of the call.
 
     Raises:
-        MembraneError: no such image, one that cannot be read, or one that does not show the markers.
+        MembraneError: an image is missing, cannot be read, or does not show the markers.
     """
     chosen: Iterator[Source]
     if arguments[0].startswith(FIRST):
@@ -60,7 +60,7 @@ def _loaded(source: Source, reconstructor: "Reconstructor", said: str) -> Tensor
 
 
 def _warn_of_contact(reconstructor: "Reconstructor", rest: Tensor, said: str) -> None:
-    """Warn if the images taken for rest show a press, compared with the sensor's rest image, or a drift that looks like one."""
+    """Warn if the rest images show a press, compared with the sensor's rest image, or a drift that looks like a press."""
     with torch.no_grad():
         result = reconstructor.from_pixels(reconstructor.observer.by_view(rest[None]))
     if Tracker(reconstructor).is_pressed(result):

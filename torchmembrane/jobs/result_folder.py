@@ -1,4 +1,4 @@
-"""The folder of a job's results: it knows the finished frames, and writes frames, figures and summary.csv."""
+"""The folder of a job's results: it keeps track of finished frames, and writes frames, figures and summary.csv."""
 
 from collections.abc import Callable
 from functools import cache
@@ -19,7 +19,7 @@ from .inputs import Inputs, frame_name
 
 
 def files_at_risk(folder: Path, inputs: Inputs, figures: bool) -> list[Path]:
-    """Files in a folder that a job would overwrite and that are not its own earlier results.
+    """Return the files in a folder that a job would overwrite and that are not results of the same job.
 
     Args:
         folder: folder of the results.
@@ -36,22 +36,22 @@ def files_at_risk(folder: Path, inputs: Inputs, figures: bool) -> list[Path]:
 class ResultFolder:
     """A folder of results, locked for writing: `with ResultFolder(...) as folder`.
 
-    Frames are on the disk `SAVE_SECONDS` after they are kept at most, summary.csv at the end; after a kill it is made anew from
-    the frames.
+    Frames are written to disk at most `SAVE_SECONDS` after `keep`, summary.csv at the end; after a crash it is rebuilt from the
+    frames.
 
     Args:
-        path: the folder.
-        mesh: what its frames share.
+        path: folder of the results.
+        mesh: data that all frames share.
         inputs: the files of this call.
-        shard: which frames of theirs are to be done here.
+        shard: part of the frames to reconstruct here.
         figures: whether every frame has a figure.
-        report: called with what is to be said.
+        report: function called with each message.
 
     Attributes:
-        finished: the frames that need not be done again.
+        finished: names of the frames that need not be reconstructed again.
 
     Raises:
-        MembraneError: on entering: the folder is of another sensor or of other settings, or another job is writing there.
+        MembraneError: on entering, if the folder belongs to another sensor or other settings, or another job is writing there.
     """
 
     def __init__(self, path: Path, mesh: Mesh, inputs: Inputs, shard: Shard, figures: bool, report: Callable[[str], None]):
@@ -82,7 +82,7 @@ class ResultFolder:
             self._lock.__exit__(kind, error, traceback)
 
     def keep(self, outcome: Outcome) -> int:
-        """Store a frame's result, or note that it has none; return its status."""
+        """Store a frame's result, or record that it has none; return its status."""
         if outcome.stored is None:
             self.frames.forget(outcome.name)
             self.summary.add_unreadable(outcome.name, outcome.file, outcome.reason)
@@ -92,11 +92,11 @@ class ResultFolder:
         return outcome.status
 
     def save(self) -> None:
-        """Write the frames that have been buffered for long enough."""
+        """Write the frames that have been buffered long enough."""
         self.frames.save()
 
     def _open(self) -> None:
-        """Read what is there: rows of summary.csv from the frames, and which of them are finished."""
+        """Read the folder: restore the rows of summary.csv from the frames, and find out which frames are finished."""
         if self._lock.alone:
             for left in [*self.path.glob(PARTIAL), *self.path.glob(f"frames/{PARTIAL}")]:
                 left.unlink(missing_ok=True)
@@ -116,7 +116,7 @@ class ResultFolder:
         self._judge({name: origins[name] for name in self.finished})
 
     def _judge(self, origins: dict[str, SourceFile]) -> None:
-        """Remove frames whose images have changed from the finished ones, and report what was found."""
+        """Remove frames whose images have changed from the finished frames, and report them."""
 
         @cache
         def is_of(origin: SourceFile, file: Path) -> bool:

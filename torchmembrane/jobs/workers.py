@@ -1,4 +1,4 @@
-"""Frames computed in this process, decoded a batch ahead, or by worker processes with one thread each."""
+"""Computation of frames in this process, with decoding one batch ahead, or by worker processes with one thread each."""
 
 import os
 from collections import deque
@@ -28,31 +28,31 @@ if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
 FRAMES_EACH = 200
-"""Frames for which a worker process is worth its start."""
+"""Number of frames per worker process that justifies its start-up time."""
 AHEAD = 3
-"""Batches that a worker process has been given and not yet returned."""
+"""Number of batches that a worker process may have been given and not yet returned."""
 LARGEST_BATCH = 16
-"""A larger one is no faster on a processor."""
+"""Largest batch on a CPU; larger batches are no faster."""
 LARGEST_GPU_BATCH = 256
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 PIXEL_BYTES = 600
 VERTEX_BYTES = 25000
-"""Memory of a frame in computation, over the pixels of its image and the vertices of its surface."""
+"""Memory used by the computation of a frame, in bytes per image pixel and per vertex of the surface."""
 MEMORY_SHARE = 0.25
-"""Share of the machine's memory for all frames that are computed at a time."""
+"""Share of the machine's memory for all frames that are computed at the same time."""
 
 
 DRAWS = "reconstruct"
-"""The command that the figures' files name."""
+"""The command named in the figure files."""
 
 
 class Work(NamedTuple):
-    """The work that is done with each batch of frames.
+    """The work to do with each batch of frames.
 
     Attributes:
-        reconstructor: makes their results.
-        figures: the folder of a figure for every frame, and the mesh of the results; None: no figures.
-        machine_code: whether the solve takes its steps by machine code, or all of them by tensor operations.
+        reconstructor: computes the results.
+        figures: folder of the figures of all frames, and the mesh of the results; None: no figures.
+        machine_code: whether the solver takes its steps in machine code, or all of them by tensor operations.
     """
 
     reconstructor: FrameReconstructor
@@ -60,7 +60,7 @@ class Work(NamedTuple):
     machine_code: bool = True
 
     def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
-        """What becomes of decoded frames."""
+        """Return the outcomes of decoded frames."""
         with using(self.machine_code), frame_in_work():
             found = self.reconstructor.outcomes(group)
         if self.figures:
@@ -76,13 +76,13 @@ class Work(NamedTuple):
 
 
 def outcomes_here(work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
-    """The outcomes of all frames, batch by batch, computed in this process while the next batch is decoded."""
+    """Yield the outcomes of all frames, batch by batch, computed in this process while the next batch is decoded."""
     for group in read_ahead(sources, work.reconstructor.reconstructor, batch):
         yield work.outcomes(group)
 
 
 def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
-    """The outcomes computed by worker processes, in the order of the sources; pictures of videos are decoded in this process.
+    """Yield the outcomes computed by worker processes, in the order of the sources; videos are decoded in this process.
 
     Raises:
         MembraneError: a worker process has ended.
@@ -106,17 +106,17 @@ def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int)
 
 
 def cores() -> int:
-    """The processor's cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def workers_for(frames: int, device: str) -> int:
-    """The number of worker processes that is worth the time of their start; 1 means this process."""
+    """Return the number of worker processes that are worth their start-up time; 1 means this process."""
     return max(1, min(cores(), frames // FRAMES_EACH)) if device == "cpu" else 1
 
 
 def batch_for(image_size: tuple[int, int], vertices: int, workers: int, device: str) -> int:
-    """The number of frames to compute at once, given the available memory."""
+    """Return the number of frames to compute at once, given the available memory."""
     if device == "cuda":
         memory, largest = torch.cuda.mem_get_info()[0], LARGEST_GPU_BATCH
     else:
@@ -125,7 +125,7 @@ def batch_for(image_size: tuple[int, int], vertices: int, workers: int, device: 
 
 
 def memory_here() -> int:
-    """The memory of the machine, or of the container if that has a limit, in bytes."""
+    """Return the memory of the machine in bytes, or the limit of its container if there is one."""
     known = hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if known else 2**32
     try:
@@ -135,13 +135,13 @@ def memory_here() -> int:
 
 
 def frame_bytes(image_size: tuple[int, int], vertices: int) -> int:
-    """An upper bound of the memory that the computation of a frame takes, in bytes."""
+    """Return an upper bound of the memory that the computation of a frame takes, in bytes."""
     width, height = image_size
     return width * height * PIXEL_BYTES + vertices * VERTEX_BYTES
 
 
 def _portable(source: Source, reconstructor: "Reconstructor") -> Source:
-    """A source that another process can load."""
+    """Return a source that another process can load."""
     if source.origin is None:
         return source
     frame = decoded(source, reconstructor)
@@ -157,7 +157,7 @@ def _given(reason: str, image: object, lacking: dict[str, str], reconstructor: "
 
 @contextmanager
 def _pool(workers: int, work: Work) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes; when the block ends early, their work is abandoned."""
+    """Yield a pool of worker processes; if the block ends early, their work is abandoned."""
     with handed_over(work) as path:
         pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (path,))
         try:
@@ -174,7 +174,7 @@ def _pool(workers: int, work: Work) -> Iterator[ProcessPoolExecutor]:
 
 
 _work: Work
-"""The work of this worker process."""
+"""The work assigned to this worker process."""
 
 
 def _start(path: Path) -> None:

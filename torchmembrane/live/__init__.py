@@ -1,1 +1,1 @@
-"""A live camera: the newest frame is reconstructed, and frames that arrive during a reconstruction are dropped."""
+"""Live cameras: the newest frame is reconstructed; frames that arrive during a reconstruction are dropped."""

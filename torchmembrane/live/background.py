@@ -1,4 +1,4 @@
-"""Work that must not hold up the loop: done by another thread, from a queue of bounded length."""
+"""Background work that must not delay the loop: it is done by another thread, from a queue of bounded length."""
 
 from collections.abc import Callable
 from queue import Full, Queue
@@ -8,25 +8,25 @@ from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
 DEPTH = 64
-"""Items that wait at most; of images of 640 x 480 in colour, 59 MB."""
+"""Largest number of waiting items; for colour images of 640 x 480 pixels, 59 MB."""
 
 
 class Background(Generic[Item]):
-    """Does something to items in a thread of its own: `with Background(keep) as later`, then `later(item)`, which never waits.
+    """Process items in a separate thread: `with Background(keep) as later`, then `later(item)`, which never waits.
 
-    An item for which the queue has no room is dropped and counted, and so is one of which `keep` raises an error. The first
-    error is told at once, and raised when the block ends; the items after it are tried all the same. Leaving the block waits
-    until the queue is empty.
+    An item for which the queue has no room is dropped and counted, as is an item for which `keep` raises an error. The first
+    error is reported at once, and raised when the block ends; later items are still processed. Leaving the block waits until
+    the queue is empty.
 
     Args:
-        keep: what is done to each item, in their order.
-        depth: items that wait at most.
-        tell: called, from the other thread, with the first error.
+        keep: function called with each item, in order.
+        depth: largest number of waiting items.
+        tell: function called from the other thread with the first error.
 
     Attributes:
-        late: items for which there was no room.
-        failed: items of which `keep` raised an error.
-        error: the first of these.
+        late: number of items for which there was no room.
+        failed: number of items for which `keep` raised an error.
+        error: the first of these errors.
 
     Example:
         >>> kept = []
@@ -47,7 +47,7 @@ class Background(Generic[Item]):
 
     @property
     def dropped(self) -> int:
-        """Items that were not kept."""
+        """Number of items that were not processed."""
         return self.late + self.failed
 
     def __enter__(self) -> "Background[Item]":
@@ -61,7 +61,7 @@ class Background(Generic[Item]):
             raise self.error
 
     def __call__(self, item: Item) -> None:
-        """Have an item kept later, or drop it."""
+        """Queue an item for processing, or drop it."""
         try:
             self._waiting.put_nowait(item)
         except Full:

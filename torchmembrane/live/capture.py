@@ -1,4 +1,4 @@
-"""Photographs of a camera with its settings held, for rest images and weights."""
+"""Photographs taken with locked camera settings, for rest images and weights."""
 
 import time
 from collections.abc import Iterator
@@ -11,15 +11,15 @@ from ..files.optional import load_opencv
 from .sources import images_of, opened_camera
 
 SETTLING = 30
-"""Images after which what a camera sets by itself has settled."""
+"""Number of images after which the camera's automatic settings have settled."""
 STALE = 3
-"""Images that were taken before the settings were held, and wait in the driver."""
+"""Number of images in the driver's queue that were taken before the settings were locked."""
 NEAR = 1e-3
-"""By how much a setting that was set may be read otherwise, over itself."""
+"""Largest relative difference between the value that was set and the value that is read back."""
 
 
 class Setting(NamedTuple):
-    """A setting of a camera, as OpenCV calls its value and the switch that gives it to the camera; "" where there is none."""
+    """A camera setting: OpenCV's names of its value and of the switch of its automatic control; "" if there is none."""
 
     name: str
     value: str
@@ -35,14 +35,14 @@ SETTINGS = (
 
 
 class Held(NamedTuple):
-    """The names of the settings that are held, and of those that the driver does not let be held."""
+    """Names of the settings that are locked, and of those that the driver does not allow to lock."""
 
     held: list[str]
     free: list[str]
 
     @property
     def said(self) -> str:
-        """In words."""
+        """Return a description in words."""
         held = f"{', '.join(self.held)} held" if self.held else "nothing held"
         return held + (
             f"; the driver does not let {', '.join(self.free)} be held: keep the light as it is" if self.free else ""
@@ -50,10 +50,10 @@ class Held(NamedTuple):
 
 
 def hold(opened: Any) -> Held:
-    """Take a camera's settings from its automatics, and set them to what they are now.
+    """Switch off a camera's automatic settings, and fix them at their current values.
 
     Args:
-        opened: `cv2.VideoCapture`.
+        opened: an open `cv2.VideoCapture`.
     """
     cv2 = load_opencv("cameras need OpenCV")
     found: dict[bool, list[str]] = {True: [], False: []}
@@ -71,22 +71,22 @@ def hold(opened: Any) -> Held:
 
 
 def _by_hand(switch: str, backend: str) -> float:
-    """The value of a switch that gives a setting to the user: of the exposure V4L2 and the other systems have their own."""
+    """Return the value that switches a setting to manual control; for the exposure, V4L2 differs from the other backends."""
     return (1.0 if backend == "V4L2" else 0.25) if switch == "AUTO_EXPOSURE" else 0.0
 
 
 class Photographs:
-    """A camera's photographs: `for name, image in Photographs(0)`; the names are times, UTC, as `summary.csv` reads them.
+    """Photographs of a camera: `for name, image in Photographs(0)`; names are UTC times, in the format of `summary.csv`.
 
     Args:
-        camera: its number, or the path or address of a stream that OpenCV opens.
-        size: width and height that are asked for and expected, px; None: the camera's own.
+        camera: number of the camera, or the path or address of a stream that OpenCV opens.
+        size: requested and expected width and height, px; None: the camera's own.
 
     Attributes:
-        settings: which are held.
+        settings: which settings are locked.
 
     Raises:
-        MembraneError: OpenCV is missing or cannot open it; it gives images of another size, or none any more.
+        MembraneError: OpenCV is missing or cannot open the camera; the images have another size, or no image comes any more.
     """
 
     def __init__(self, camera: int | str, size: tuple[int, int] | None = None):
@@ -101,10 +101,10 @@ class Photographs:
             next(self._images)
 
     def take(self, count: int, every: float = 0.0) -> Iterator[tuple[str, np.ndarray]]:
-        """So many photographs, at least `every` seconds apart; the camera is released after the last one.
+        """Yield `count` photographs, at least `every` seconds apart; the camera is released after the last one.
 
         Yields:
-            The name, a time as `20260927T113829250`, and the image, RGB `[height, width, 3]` or grey `[height, width]`.
+            The name, a time such as `20260927T113829250`, and the image, RGB `[height, width, 3]` or grey `[height, width]`.
         """
         due = time.monotonic()
         try:

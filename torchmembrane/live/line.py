@@ -1,4 +1,4 @@
-"""The line that says how a stream goes: rewritten in place in a terminal, line by line elsewhere."""
+"""The status line of a stream: overwritten in place in a terminal, written line by line elsewhere."""
 
 import shutil
 import time
@@ -12,16 +12,16 @@ from ..results.view_status import status_in_words
 from .loop import RECENT, LiveFrame, StreamStats
 
 TERMINAL_SECONDS, PLAIN_SECONDS = 0.1, 1.0
-"""Between two lines, at least."""
+"""Shortest time between two lines, seconds."""
 DIGITS = 4  # of the largest component of force and moment
 
 
 class StatusLine:
-    """Shows the latest frame, with rate and latency over the last `RECENT` frames.
+    """Show the latest frame, with rate and latency over the last `RECENT` frames.
 
     Args:
         mesh: mesh of the stream.
-        file: where to write.
+        file: stream to which the line is written.
     """
 
     def __init__(self, mesh: Mesh, file: TextIO):
@@ -29,7 +29,7 @@ class StatusLine:
         self._next = 0.0
 
     def __call__(self, seen: LiveFrame, stats: StreamStats) -> None:
-        """Show a frame, if it is time."""
+        """Show a frame, unless the previous line was written too recently."""
         at = time.monotonic()
         if at < self._next:
             return
@@ -41,7 +41,7 @@ class StatusLine:
             self._write(f"{text}\n")
 
     def say(self, text: str) -> None:
-        """A line that stays."""
+        """Write a line that is not overwritten."""
         self._write(f"\r\x1b[K{text}\n" if self._in_place else f"{text}\n")
 
     def _write(self, text: str) -> None:
@@ -50,7 +50,7 @@ class StatusLine:
 
 
 def described(seen: LiveFrame, stats: StreamStats, mesh: Mesh) -> str:
-    """One line with rate, latency, dropped pictures, status, wrench and change of pressure."""
+    """Return one line with rate, latency, dropped pictures, status, wrench and pressure change."""
     milliseconds = [1000 * stats.latency(percent, RECENT) for percent in (50, 95)]
     rate = f"{stats.rate(RECENT):.1f} Hz, " if stats.followed > 1 else ""
     pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, stats.dropped)
@@ -67,7 +67,7 @@ def described(seen: LiveFrame, stats: StreamStats, mesh: Mesh) -> str:
 
 
 def summary(stats: StreamStats) -> str:
-    """What became of all pictures."""
+    """Return a line with the numbers of captured, followed and dropped pictures."""
     if not stats.followed:
         return "no frame was captured"
     without = f", {stats.failed} of them without a surface" if stats.failed else ""

@@ -1,4 +1,4 @@
-"""The loop: take the newest picture, compute, hand on what was seen; and what is counted on the way."""
+"""The live loop: take the newest picture, reconstruct it, pass the result on, and keep statistics."""
 
 from array import array
 from collections import deque
@@ -16,22 +16,22 @@ from .mailbox import Captured, Mailbox, now
 from .streams import Stream
 
 WAIT = 0.1
-"""Seconds after which the loop looks whether it shall stop, though no picture comes."""
+"""Seconds after which the loop checks whether to stop if no picture arrives."""
 RECENT = 100
-"""Frames over which the rate and latency that are shown as they go are taken."""
+"""Number of latest frames over which the displayed rate and latency are taken."""
 Request = Callable[[Stream], str]
-"""A request to a stream between two frames, such as taking the latest one for rest; it returns the answer."""
+"""A request to a stream between two frames, such as taking the latest one for rest; it returns a message."""
 
 
 class LiveFrame(NamedTuple):
-    """A frame as it was followed.
+    """A reconstructed frame of a stream.
 
     Attributes:
-        number: number of the capture, from 0.
+        number: number of the captured picture, from 0.
         time: time of the capture, seconds since 1970.
-        image: as it was captured.
-        frame: its result's arrays.
-        latency: from the capture to the result, seconds.
+        image: image as captured.
+        frame: arrays of the result.
+        latency: time from the capture to the result, seconds.
     """
 
     number: int
@@ -42,12 +42,12 @@ class LiveFrame(NamedTuple):
 
     @property
     def images(self) -> list[np.ndarray | None]:
-        """The image, or those of all views."""
+        """Return the image in a list, or the images of all views."""
         return [self.image] if isinstance(self.image, np.ndarray) else self.image
 
     @property
     def name(self) -> str:
-        """Of the frame in a recording: its number.
+        """Name of the frame in a recording: its number.
 
         Example:
             >>> LiveFrame(12, 0.0, np.zeros((1, 1)), {}, 0.0).name
@@ -57,13 +57,13 @@ class LiveFrame(NamedTuple):
 
 
 class StreamStats:
-    """Counts of a run.
+    """Statistics of a run.
 
     Attributes:
-        captured: pictures, to the latest one that was followed.
-        failed: frames without a surface.
-        times: times of the captures of the frames followed, seconds since 1970.
-        latencies: latencies of the same, seconds.
+        captured: number of pictures up to the latest reconstructed one.
+        failed: number of frames without a surface.
+        times: capture times of the reconstructed frames, seconds since 1970.
+        latencies: latencies of the same frames, seconds.
 
     Example:
         >>> stats = StreamStats()
@@ -78,7 +78,7 @@ class StreamStats:
         self.times, self.latencies = array("d"), array("d")
 
     def add(self, seen: LiveFrame) -> None:
-        """One more frame."""
+        """Add a frame."""
         self.captured = seen.number + 1
         self.failed += not Status(int(seen.frame["status"])).has_surface
         self.times.append(seen.time)
@@ -86,22 +86,22 @@ class StreamStats:
 
     @property
     def followed(self) -> int:
-        """Frames that have a result."""
+        """Number of frames that have a result."""
         return len(self.times)
 
     @property
     def dropped(self) -> int:
-        """Pictures that a newer one displaced before they could be taken."""
+        """Number of pictures that were replaced by a newer one before they could be taken."""
         return self.captured - self.followed
 
     def rate(self, frames: int = 0) -> float:
-        """Frames per second, of the last so many, by default of all; NaN before there are two."""
+        """Return frames per second over the last `frames` frames, by default over all; NaN for fewer than two frames."""
         times = self.times[-frames:]
         return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else float("nan")
 
     def latency(self, percent: float, frames: int = 0) -> float:
-        """Seconds that so many percent of the latencies do not exceed, of the last so many frames, by default of all; NaN
-        before there is one."""
+        """Return a percentile of the latencies, seconds, over the last `frames` frames, by default over all; NaN if there are
+        none."""
         return float(np.percentile(self.latencies[-frames:], percent)) if self.followed else float("nan")
 
 
@@ -114,19 +114,19 @@ def follow(
     requests: deque[Request] | None = None,
     report: Callable[[str], None] = print,
 ) -> None:
-    """Follow a camera until it ends or is stopped.
+    """Reconstruct the pictures of a camera until it ends or is stopped.
 
     Args:
-        stream: computes.
-        mailbox: has the newest picture.
-        stats: is given every frame.
-        watchers: called with every frame and the counts so far, at once: what takes long is theirs to put off.
-        stop: set to end.
-        requests: asked of the stream before the next frame, and taken out; one that is refused is said.
-        report: called with what is to be said.
+        stream: computes the results.
+        mailbox: holds the newest picture.
+        stats: receives every frame.
+        watchers: functions called synchronously with every frame and the statistics so far; they must defer slow work.
+        stop: event that ends the loop.
+        requests: queue of requests that are removed and sent to the stream before the next frame; a refusal is reported.
+        report: function called with each message.
 
     Raises:
-        MembraneError: an image of another size than the sensor's, or what the source raised.
+        MembraneError: the size of an image differs from the sensor's; any error of the source is raised as well.
     """
     while not stop.is_set():
         while requests:
@@ -152,6 +152,6 @@ def _answer(request: Request, stream: Stream) -> str:
 
 
 def rezeroed(stream: Stream) -> str:
-    """Take the latest frame for rest."""
+    """Take the latest frame for rest, and return a message."""
     stream.rezero()
     return "the latest frame is taken for rest"

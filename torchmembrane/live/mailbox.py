@@ -1,4 +1,4 @@
-"""The newest picture of a camera, handed from the thread that captures to the one that computes."""
+"""A mailbox for the newest picture of a camera, between the capturing thread and the computing thread."""
 
 import time
 from collections.abc import Iterator
@@ -10,25 +10,26 @@ import numpy as np
 
 EPOCH = time.time() - time.perf_counter()
 ENDING = 1.0
-"""Seconds for a camera to give its last picture before its thread is left behind."""
+"""Seconds to wait for a camera's last picture before its thread is abandoned."""
 
 
 Captured: TypeAlias = "np.ndarray | list[np.ndarray | None]"
-"""An image `[height, width]` or `[height, width, 3]`; of views that have images of their own one each, or None."""
+"""An image `[height, width]` or `[height, width, 3]`; for views with images of their own, a list with an image or None for
+each."""
 
 
 def now() -> float:
-    """Seconds since 1970 by a clock that never goes back: set when the program starts."""
+    """Return seconds since 1970 by a monotonic clock, which is set when the program starts."""
     return EPOCH + time.perf_counter()
 
 
 class CapturedFrame(NamedTuple):
-    """An image as it was captured.
+    """An image as captured.
 
     Attributes:
-        number: number of the capture, from 0; those of dropped pictures are missing among the pictures taken.
-        image: as captured.
-        time: time of the capture, as `now` gives it.
+        number: number of the capture, from 0; the numbers of dropped pictures are skipped.
+        image: image as captured.
+        time: capture time, as returned by `now`.
     """
 
     number: int
@@ -37,11 +38,11 @@ class CapturedFrame(NamedTuple):
 
 
 class Mailbox:
-    """Holds one picture: a newer one takes its place.
+    """A mailbox for one picture: a newer picture replaces it.
 
     Attributes:
-        captured: pictures so far.
-        ended: whether no picture will come any more.
+        captured: number of pictures so far.
+        ended: whether no more pictures will come.
 
     Example:
         >>> mailbox = Mailbox()
@@ -58,23 +59,23 @@ class Mailbox:
         self._changed = Condition()
 
     def put(self, image: Captured) -> None:
-        """A picture captured now."""
+        """Put in a picture captured now."""
         with self._changed:
             self._picture = CapturedFrame(self.captured, image, now())
             self.captured += 1
             self._changed.notify()
 
     def end(self, error: BaseException | None = None) -> None:
-        """No picture will come any more, because of an error or without one."""
+        """Declare that no more pictures will come, with or without an error as the cause."""
         with self._changed:
             self.ended, self._error = True, self._error or error
             self._changed.notify()
 
     def take(self, seconds: float) -> CapturedFrame | None:
-        """The picture that waits, or the next one if it comes within so many seconds.
+        """Return the waiting picture, or the next one if it arrives within `seconds`; otherwise None.
 
         Raises:
-            BaseException: what ended the capture, once the last picture is taken.
+            BaseException: the error that ended the capture, once the last picture has been taken.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._picture is not None or self.ended, seconds)
@@ -86,7 +87,7 @@ class Mailbox:
 
 @contextmanager
 def capture(images: Iterator[Captured]) -> Iterator[Mailbox]:
-    """A mailbox into which a thread puts these images as they come, until the block ends."""
+    """Yield a mailbox that a thread fills with these images as they arrive, until the block ends."""
     mailbox = Mailbox()
     thread = Thread(target=_capture, args=(images, mailbox), name="capture", daemon=True)
     thread.start()

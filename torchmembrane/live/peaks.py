@@ -1,4 +1,4 @@
-"""The largest load of a stream, and of a sensor's life, kept in a file that the user names."""
+"""The largest load of a stream, and of a sensor's life, which is stored in a file that the user names."""
 
 import json
 from datetime import date
@@ -15,22 +15,22 @@ from ..results.status import Status
 from ..results.store import Mesh
 
 COUNTED = (Status.OK, Status.OUT_OF_RANGE)
-"""Statuses of the frames whose loads count: of others the answer is not to be relied on."""
+"""Statuses of the frames whose loads count; other frames have unreliable results."""
 MOST_BYTES = 2**16
 EXPECTED = "the file of a sensor's life as `live --life` keeps it"
 NUMBERS = ("force", "depth", "frames")
 
 
 class Peaks:
-    """The largest force and depth of the frames that were given.
+    """The largest force and depth of the frames added so far.
 
     Args:
         mesh: mesh of the stream.
 
     Attributes:
-        force: magnitude of the largest contact force; zero before there is one.
-        depth: the deepest displacement along the inward rest normal.
-        frames: how many counted.
+        force: magnitude of the largest contact force; zero if no frame has counted.
+        depth: largest displacement along the inward rest normal.
+        frames: number of frames that counted.
     """
 
     def __init__(self, mesh: Mesh):
@@ -39,7 +39,7 @@ class Peaks:
         self.frames = 0
 
     def add(self, frame: Frame) -> None:
-        """One more frame; only those with status ok or out of range count."""
+        """Add a frame; only frames with status ok or out of range count."""
         if int(frame["status"]) in COUNTED:
             self.force = max(self.force, float(np.linalg.norm(frame["force"])))
             self.depth = max(self.depth, -float(self.mesh.normal_displacement(frame).min()))
@@ -47,17 +47,17 @@ class Peaks:
 
     @property
     def said(self) -> str:
-        """In words."""
+        """Return a description in words."""
         return f"peaks of {self.frames} frames: {_load(self.force, self.depth, self.mesh)}"
 
     def kept_in(self, path: Path) -> str:
-        """Add them to a sensor's life, and say what that has seen.
+        """Merge the peaks into the file of the sensor's life, and return a description of the merged values.
 
         Args:
-            path: path of the file, made where there is none.
+            path: path of the file; it is created if it does not exist.
 
         Raises:
-            MembraneError: the file is another, or of a sensor of another name or other units.
+            MembraneError: the file is of another kind, or of a sensor with another name or other units.
         """
         mesh = self.mesh
         own = {"name": mesh.name, "length_unit": mesh.length_unit, "force_unit": mesh.force_unit}

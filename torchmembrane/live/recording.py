@@ -1,4 +1,4 @@
-"""Recording of a stream: captured images, results as `torchmembrane reconstruct` writes them, and times."""
+"""Recording of a stream: captured images, results in the format of `torchmembrane reconstruct`, and times."""
 
 import csv
 from collections.abc import Iterator
@@ -28,20 +28,20 @@ MOST_TIMES_BYTES = 2**28
 
 
 class Recording:
-    """A new folder of results of a stream: `with Recording(folder, mesh) as recording`, `recording.keep(seen)`.
+    """A new folder with the results of a stream: `with Recording(folder, mesh) as recording`, `recording.keep(seen)`.
 
-    The folder holds `images/NAME.png` (`.tiff` where 16 bits do not hold the values), of views with images of their own
-    `images/NAME_VIEW.png`, NAME.npz, mesh.npz and summary.csv as of `torchmembrane reconstruct`, and times.csv: `name`, `time`
-    of the capture (seconds since 1970) and `latency` (seconds). NAME is the number of the capture.
+    The folder holds `images/NAME.png` (`.tiff` if 16 bits do not hold the values exactly; `images/NAME_VIEW.png` for views with
+    images of their own), NAME.npz, mesh.npz and summary.csv as `torchmembrane reconstruct` writes them, and times.csv with the
+    columns `name`, `time` (of the capture, seconds since 1970) and `latency` (seconds). NAME is the number of the capture.
 
     Args:
-        folder: new or empty.
-        mesh: what the frames share.
-        bits: bits of the camera, where 16 hold fewer.
+        folder: new or empty folder.
+        mesh: data that all frames share.
+        bits: bit depth of the camera, if 16-bit values use fewer bits.
 
     Raises:
-        MembraneError: the folder holds something; of `keep`, and when the block ends: it cannot be written to. Where the block
-            ends in another error, that is a warning.
+        MembraneError: the folder is not empty; from `keep` and at the end of the block: the folder cannot be written to. If the
+            block ends with another error, this is a warning instead.
     """
 
     def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
@@ -78,7 +78,7 @@ class Recording:
             csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))
 
     def _images(self, seen: LiveFrame) -> Iterator[Path]:
-        """The frame's image files, written."""
+        """Write the frame's image files and yield their paths."""
         path = self.folder / IMAGES
         if isinstance(seen.image, np.ndarray):
             yield write_as_taken(path / seen.name, seen.image, self.bits)
@@ -89,10 +89,10 @@ class Recording:
 
 
 def times_of(folder: Path) -> dict[str, float]:
-    """When the frames of a recording were captured, seconds since 1970, by name; nothing of other folders.
+    """Return the capture times of a recording's frames by name, seconds since 1970; empty for other folders.
 
     Raises:
-        MembraneError: its times cannot be read.
+        MembraneError: the file of times cannot be read.
     """
     path = folder / TIMES
     if not path.exists():

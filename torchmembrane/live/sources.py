@@ -1,4 +1,4 @@
-"""Images as they come: of a camera, or of files at a pace."""
+"""Sources of live images: a camera, or files played at a given rate."""
 
 import time
 from collections.abc import Generator, Iterable, Iterator
@@ -17,42 +17,42 @@ from ..user_warnings import warn_user
 from .mailbox import Captured
 
 MOST_MISSED = 100
-"""Reads of a camera that fail in a row before it is given up."""
+"""Number of consecutive failed reads after which a camera is given up."""
 BREATH = 0.01
-"""Seconds between them."""
+"""Seconds between failed reads."""
 IMAGE_RATE = 30.0
-"""Hz, of images, and of a video that says nothing of its pace."""
+"""Default rate, Hz, for images and for videos that declare no rate."""
 
 
 class Timed(NamedTuple):
-    """An image of a recording, and when it is due: seconds since the recording's beginning."""
+    """An image of a recording and the time at which it is due, in seconds since the beginning of the recording."""
 
     due: float
     image: Captured
 
 
 def camera_images(camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """The images of a camera by OpenCV, RGB `[height, width, 3]` or grey `[height, width]`, without end.
+    """Yield the images of a camera through OpenCV, RGB `[height, width, 3]` or grey `[height, width]`, without end.
 
     Args:
-        camera: its number, or the path or address of a stream that OpenCV opens.
-        size: width and height that are asked for and expected, px.
+        camera: number of the camera, or the path or address of a stream that OpenCV opens.
+        size: requested and expected width and height, px.
 
     Raises:
-        MembraneError: OpenCV is missing or cannot open it; it gives images of another size, or none any more.
+        MembraneError: OpenCV is missing or cannot open the camera; the images have another size, or no image comes any more.
     """
     return images_of(opened_camera(camera, size), camera, size)
 
 
 def opened_camera(camera: int | str, size: tuple[int, int] | None) -> Any:
-    """A `cv2.VideoCapture` of a camera.
+    """Open a camera and return its `cv2.VideoCapture`.
 
     Args:
-        camera: as of `camera_images`.
-        size: width and height that are asked for, px; None: the camera's own.
+        camera: as for `camera_images`.
+        size: requested width and height, px; None: the camera's own.
 
     Raises:
-        MembraneError: OpenCV is missing or cannot open it.
+        MembraneError: OpenCV is missing or cannot open the camera.
     """
     cv2 = load_opencv("cameras need OpenCV")
     opened = cv2.VideoCapture(camera)
@@ -66,7 +66,7 @@ def opened_camera(camera: int | str, size: tuple[int, int] | None) -> Any:
 
 
 def images_of(opened: Any, camera: int | str, size: tuple[int, int] | None) -> Generator[np.ndarray, None, None]:
-    """The images of an opened camera, as of `camera_images`, until it gives none any more; then it is released."""
+    """Yield the images of an open camera, as `camera_images` does, until no more come; then release the camera."""
     missed = 0
     try:
         while missed < MOST_MISSED:
@@ -84,7 +84,7 @@ def images_of(opened: Any, camera: int | str, size: tuple[int, int] | None) -> G
 
 
 def _red_first(image: np.ndarray, camera: int | str) -> np.ndarray:
-    """A frame of OpenCV's - grey, BGR or BGRA - as grey `[height, width]` or RGB."""
+    """Convert a frame of OpenCV (grey, BGR or BGRA) to grey `[height, width]` or RGB."""
     channels = 1 if image.ndim == 2 else image.shape[-1]
     if channels == 1:
         return image.reshape(image.shape[:2])
@@ -97,13 +97,13 @@ def _red_first(image: np.ndarray, camera: int | str) -> np.ndarray:
 
 
 def video_images(path: Path, size: tuple[int, int], rate: float | None, bits: int | None = None) -> Iterator[Timed]:
-    """The pictures of a video, RGB `[height, width, 3]` uint8 or grey `[height, width]` in 0..1, due at its own pace or at
-    `rate`, Hz; those of an image file of several pictures, which has no pace of its own, at `IMAGE_RATE`.
+    """Yield the pictures of a video, RGB `[height, width, 3]` uint8 or grey `[height, width]` in 0..1, due at its own rate or
+    at `rate`, Hz; the pictures of an image file, which has no rate of its own, at `IMAGE_RATE`.
 
-    One that is damaged is left out, with a warning.
+    A damaged picture is skipped with a warning.
 
     Raises:
-        MembraneError: PyAV is missing; the file is no video, ends early, or is of another size.
+        MembraneError: PyAV is missing; the file is not a video, ends early, or has another size.
     """
     if picture_count(path, 1):
         yield from _of_files([path], size, rate or IMAGE_RATE, bits)
@@ -121,10 +121,10 @@ def video_images(path: Path, size: tuple[int, int], rate: float | None, bits: in
 
 
 def folder_images(folder: Path, size: tuple[int, int], rate: float, bits: int | None = None) -> Iterator[Timed]:
-    """The images of a folder in name order, of a file of several pictures all of them, grey `[height, width]` in 0..1, due at
-    `rate`, Hz.
+    """Yield the images of a folder in name order, and all pictures of a file of several, as grey `[height, width]` in 0..1, due
+    at `rate`, Hz.
 
-    One that cannot be read is left out, with a warning.
+    An image that cannot be read is skipped with a warning.
 
     Raises:
         MembraneError: the folder holds no images.
@@ -155,7 +155,7 @@ def _leave_out(said: object) -> None:
 
 
 def paced(images: Iterable[Timed]) -> Iterator[Captured]:
-    """Images when they are due; those that come too late are given at once.
+    """Yield images when they are due; images that are late are yielded at once.
 
     Example:
         >>> [image.item() for image in paced(Timed(0.001 * k, np.array(k)) for k in range(3))]

@@ -1,4 +1,4 @@
-"""What turns a stream's images into results, one after another: torch, or an exported model."""
+"""Streams turn images into results one by one, with torch or with an exported model."""
 
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,10 +16,10 @@ from .mailbox import Captured
 
 
 class Stream(Protocol):
-    """Called with an image, RGB or grey, or with one of each view, and its time, seconds; gives the frame's arrays.
+    """Function of an image (RGB or grey, or one image per view) and its time in seconds that returns the frame's arrays.
 
     Attributes:
-        mesh: what the frames share.
+        mesh: data that all frames share.
     """
 
     mesh: Mesh
@@ -30,14 +30,15 @@ class Stream(Protocol):
         """Take the latest frame for rest."""
 
     def weigh(self, force: float) -> str:
-        """Compare the latest frame with a weight, N, that stands on the membrane; says what came of it."""
+        """Compare the latest frame with a weight, N, that stands on the membrane; return the comparison in words."""
 
     def gauge(self, pressure_change: float) -> str:
-        """Compare the latest frame with the change since rest, force unit / length unit^2, that a gauge reads; likewise."""
+        """Compare the latest frame with a gauge's pressure change since rest, force unit / length unit^2; return it in
+        words."""
 
 
 class TrackedStream:
-    """By a `Tracker`.
+    """A stream computed by a `Tracker`.
 
     Example:
         >>> import torchmembrane as tm
@@ -59,16 +60,16 @@ class TrackedStream:
         """Take the latest frame for rest.
 
         Raises:
-            MembraneError: there is none, or it does not show the markers.
+            MembraneError: there is no frame yet, or it does not show the markers.
         """
         self.tracker.rezero()
 
     def weigh(self, force: float) -> str:
-        """As `Tracker.weigh`, in words."""
+        """Return the comparison of `Tracker.weigh` in words."""
         return self._compared("force", self.tracker.weigh(force))
 
     def gauge(self, pressure_change: float) -> str:
-        """As `Tracker.gauge`, in words."""
+        """Return the comparison of `Tracker.gauge` in words."""
         return self._compared("change of pressure", self.tracker.gauge(pressure_change))
 
     def _compared(self, what: str, ratio: float) -> str:
@@ -79,16 +80,16 @@ class TrackedStream:
 
 
 class ModelStream:
-    """By a model of `torchmembrane export`, run by onnxruntime; one that tracks follows dots from frame to frame.
+    """A stream computed by a model from `torchmembrane export` with onnxruntime; a tracking model follows dots between frames.
 
     Args:
         path: path of the model.
-        sensor: the fingerprint that it must have been exported from.
+        sensor: fingerprint of the sensor from which the model must have been exported.
         threads: number of threads of onnxruntime.
 
     Raises:
-        MembraneError: torchmembrane-edge is missing; no model, or that of another sensor; of a call: an image that the
-            model does not take, such as one with values beyond the camera's bits.
+        MembraneError: torchmembrane-edge is missing; the file is not a model, or is one of another sensor; when called: the
+            model refuses the image, for instance because of values beyond the camera's bit depth.
     """
 
     def __init__(self, path: Path, sensor: str, threads: int = 1):
@@ -114,22 +115,22 @@ class ModelStream:
         return completed({key: values[0] for key, values in self._before.items()})
 
     def _batch(self, image: Captured) -> Any:
-        """A batch of one as the model takes it; a view without an image is left out."""
+        """Return a batch of one frame in the model's format; a view without an image is left out."""
         return image[None] if isinstance(image, np.ndarray) else [each if each is None else each[None] for each in image]
 
     def rezero(self) -> None:
-        """Refused.
+        """Raise an error, as a model cannot be rezeroed.
 
         Raises:
-            MembraneError: always: the rest state is baked into a model.
+            MembraneError: always, because the rest state is part of the model.
         """
         raise MembraneError("rezero: an exported model has its rest state baked in; leave --model out, or export it again")
 
     def weigh(self, force: float) -> str:
-        """Refused, as `gauge`.
+        """Raise an error, as `gauge` does.
 
         Raises:
-            MembraneError: always: loads are compared where torch computes.
+            MembraneError: always, because known loads are compared only in a stream computed by torch.
         """
         raise MembraneError("a known load is not compared with an exported model's results; leave --model out")
 

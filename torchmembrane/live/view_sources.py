@@ -1,4 +1,4 @@
-"""Images of several views as they come, one of each for every moment: of cameras, or of files at a pace."""
+"""Live images of several views, one per view for every moment, from cameras or from files played at a given rate."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -18,23 +18,23 @@ from .mailbox import Captured, Mailbox, capture
 from .sources import Timed, video_images
 
 PATIENCE = 0.2
-"""Seconds that a moment waits for a camera's picture."""
+"""Seconds that a moment waits for the picture of a camera."""
 
 
 def moments_of_cameras(cameras: Mapping[str, Iterator[Captured]]) -> Iterator[Captured]:
-    """What several cameras show at once: as soon as each has a new picture, the newest of each.
+    """Yield the images of several cameras for each moment: as soon as every camera has a new picture, the newest of each.
 
-    A camera without one for `PATIENCE` seconds lacks its picture at this moment. One that gives none any more is said once, and
-    the others go on.
+    A camera that delivers no picture for `PATIENCE` seconds has none at this moment. If a camera stops for good, this is
+    reported once, and the others continue.
 
     Args:
-        cameras: by the names of their views, their images as they come.
+        cameras: the images of each camera as they arrive, by the name of its view.
 
     Yields:
-        Of each view its image, or None.
+        For each view its image, or None.
 
     Raises:
-        BaseException: what ended the last of them.
+        BaseException: the error that ended the last camera.
     """
     with ExitStack() as stack:
         boxes: dict[str, Mailbox] = {name: stack.enter_context(capture(images)) for name, images in cameras.items()}
@@ -47,7 +47,8 @@ def moments_of_cameras(cameras: Mapping[str, Iterator[Captured]]) -> Iterator[Ca
 
 
 def _taken(name: str, boxes: dict[str, Mailbox], seconds: float) -> np.ndarray | None:
-    """A camera's newest image, None where there is none within so many seconds; one that has ended leaves the boxes."""
+    """Return a camera's newest image, or None if none arrives within `seconds`; remove a camera that has ended from the
+    boxes."""
     box = boxes[name]
     try:
         picture = box.take(seconds)
@@ -63,15 +64,15 @@ def _taken(name: str, boxes: dict[str, Mailbox], seconds: float) -> np.ndarray |
 
 
 def moments_of_videos(path: Path, views: Sequence[View], rate: float | None) -> Iterator[Timed]:
-    """The pictures of the views' videos, NAME_VIEW.mp4, as of `video_images`, matched by their times.
+    """Yield the pictures of the views' videos NAME_VIEW.mp4, read as by `video_images`, matched by their times.
 
     Args:
-        path: of the first view's; the others lie beside it.
-        views: of the sensor.
-        rate: Hz, in place of the videos' own.
+        path: path of the first view's video; the others lie beside it.
+        views: views of the sensor.
+        rate: rate in Hz, in place of the videos' own.
 
     Raises:
-        MembraneError: as of `video_images`.
+        MembraneError: as for `video_images`.
     """
     files = view_files(path, [view.name for view in views])
     streams = [_timed(file, view, rate) for file, view in zip(files, views, strict=True)]
@@ -86,8 +87,8 @@ def _timed(file: Path, view: View, rate: float | None) -> Iterator[TimedPicture[
 
 
 def moments_of_folder(folder: Path, views: Sequence[View], rate: float) -> Iterator[Timed]:
-    """The images of a folder, NAME_VIEW.png, in name order, due at `rate`, Hz; a view whose image cannot be read lacks it, with
-    a warning.
+    """Yield the images of a folder, NAME_VIEW.png, in name order, due at `rate`, Hz; if a view's image cannot be read, the view
+    has none at that moment, with a warning.
 
     Raises:
         MembraneError: the folder holds no images of the views.
