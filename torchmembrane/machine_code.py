@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import numpy as np
@@ -22,9 +22,9 @@ from torch import Tensor
 
 from .interruption import unstoppable
 
-Constants = TypeVar("Constants")
 SECONDS = 45
-"""Approximate time to compile the steps for one precision: 30 s on a core with AVX-512, 62 s on an AMD EPYC with AVX2."""
+"""Approximate time to compile the steps for one precision: 30 s on a core with AVX-512, 52 s on an AMD EPYC core with AVX2, in
+`python tests/compile.py float32` with an empty `NUMBA_CACHE_DIR`."""
 
 _used = ContextVar("machine code is used", default=True)
 
@@ -79,6 +79,9 @@ each literal, and let loops that need not be unrolled take their length from an 
 def kept(function: Callable[..., Any]) -> Any:
     """Decorate a function so that it is compiled and cached on disk, beside its file or in the user's cache, until that file
     changes. If neither place can be written, the code is cached in this process only.
+
+    A function is compiled again for each precision and each memory layout of an argument: pass contiguous arrays in row-major
+    order.
 
     Example:
         >>> kept(lambda x: 2 * x)(3)
@@ -144,24 +147,6 @@ class Kept:
 def fingerprint(*files: str | None) -> str:
     """Return a hash of source files: a `kept` function with it in its closure is compiled again when one of them changes."""
     return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
-
-
-def row_major(constants: Constants) -> Constants:
-    """Return the constants of a `kept` function, an array or (named) tuples of arrays, with contiguous arrays in row-major
-    order. A function is compiled again for each memory layout of each array.
-
-    Example:
-        >>> row_major((np.zeros((3, 4))[:, :2], 1.0))[0].flags.c_contiguous
-        True
-    """
-    made: Any = constants
-    if isinstance(constants, np.ndarray):
-        made = np.ascontiguousarray(constants)
-    elif isinstance(constants, tuple):
-        each = map(row_major, constants)
-        made = type(constants)(*each) if hasattr(constants, "_fields") else tuple(each)
-    result: Constants = made
-    return result
 
 
 def aligned(size: int, dtype: np.dtype) -> np.ndarray:

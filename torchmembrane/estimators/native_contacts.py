@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from ..machine_code import Kept, compiled, fingerprint, kept, row_major
+from ..machine_code import Kept, compiled, fingerprint, kept
 from ..solve import native_rows
 from ..solve.native_rows import sum_rows, within
 from ..surface.tangent import ALONG_Z
@@ -325,5 +325,4 @@ def _constants(owner: Any, surroundings: Tensor, limits: Limits) -> Constants:
     rows = np.ascontiguousarray(surroundings.numpy(), dtype)
     rest = np.ascontiguousarray(membrane.rest.numpy().reshape(*membrane.grid, 3))
     area, near, beside = (each.numpy().astype(dtype) for each in (membrane.rest_area, owner.near_rim, owner.beside_rim))
-    numbers = (*limits, owner.least_span, membrane.size)
-    return row_major(Constants(rest, area, near, beside, rows, within(rows), *numbers))
+    return Constants(rest, area, near, beside, rows, within(rows), *limits, owner.least_span, membrane.size)

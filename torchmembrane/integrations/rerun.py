@@ -32,11 +32,10 @@ class RerunLog:
     """A Rerun recording of one sensor's frames: `with RerunLog(mesh, "press.rrd") as log`, then `log.add(...)`.
 
     Entities: `camera/image`, with `rest`, `flow` (`LONGER` times as long) and `lost` markers; `surface/now`, coloured by
-        compressive normal traction, with `traction`, `contacts` and `forces`, beside `surface/rest`; the curves `force`,
-        `moment` and `pressure`; `status`, logged when it changes. Frames that hold fields add `fields/stretch` and
-        `fields/tension`, the surface coloured by the larger principal value, and the curves `largest/stretch` and
-        `largest/tension`. Timelines: `frame`, and `time` if it is known. Colours and arrows are scaled to the largest value so
-        far.
+    compressive normal traction, with `traction`, `contacts` and `forces`, beside `surface/rest`; the curves `force`, `moment`
+    and `pressure`; `status`, logged when it changes. Frames that hold fields add `fields/stretch` and `fields/tension`, the
+    surface coloured by the larger principal value, and the curves `largest/stretch` and `largest/tension`. Timelines: `frame`,
+    and `time` if it is known. Colours and arrows are scaled to the largest value so far.
 
     Args:
         mesh: data that all frames share.

@@ -6,6 +6,8 @@ of frames without contact, whitened by the frozen noise of the rest image, is pr
 distribution with k degrees of freedom, where `v = 1 + share x scatter` adds the noise that remains in the frames' mean. With a
 harmless drift of `LEAST_DRIFT`, the distribution is noncentral, with parameter `lambda`. Therefore
 
+    z = (S / v - k - lambda) / sqrt(2 k + 4 lambda)
+
 is the number of standard deviations beyond both. A contact that is too light to be detected moves only the markers near it and
 leaves a large `U`.
 """

@@ -50,7 +50,7 @@ def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Tensor, dtyp
     law = [c1 * l2, 0.0 if elasticity.model == "harmonic" else c1 / l2**2, c2 / l2, c2 * l2**2, membrane.outward / 6]
 
     def array(values: Tensor, *shape: int) -> np.ndarray:
-        return np.asarray(values.numpy().reshape(shape), dtype)
+        return np.ascontiguousarray(values.numpy().reshape(shape), dtype)
 
     cells = 2, m - 1, n - 1
     return Surface(

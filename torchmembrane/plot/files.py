@@ -1,4 +1,4 @@
-"""Figures as files: written whole, and known by the command that drew them. Nothing here loads matplotlib."""
+"""Figures as PNG files that name the command which drew them. This module does not load matplotlib."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def save(drawing: "Figure", path: str | Path, command: str = "") -> None:
-    """Write a figure as PNG, whole or not at all.
+    """Write a figure as PNG, atomically.
 
     Args:
         drawing: the figure.
-        path: the file; its folder is made if need be.
-        command: that draws it; the file says so, and `drawn_by` reads it.
+        path: path of the file; its folder is created if necessary.
+        command: name of the command that draws the figure, stored in the file for `drawn_by`.
 
     Example:
         >>> from matplotlib.figure import Figure
@@ -35,11 +35,11 @@ def save(drawing: "Figure", path: str | Path, command: str = "") -> None:
 
 
 def drawn_by(command: str, path: Path) -> bool:
-    """Whether a file is a figure that a command of torchmembrane drew, which may draw it anew.
+    """Return whether a file is a figure drawn by this command of torchmembrane, which may then overwrite it.
 
     Args:
-        command: as for `save` was told.
-        path: any file.
+        command: name of the command, as given to `save`.
+        path: path of any file.
 
     Example:
         >>> drawn_by("check", Path("examples/rest.png"))

@@ -1,6 +1,6 @@
 """Resampling of a grid of vertices to other numbers of lines, equally spaced along the surface.
 
-scipy.interpolate, which takes 0.2 s to import, is loaded only where a grid is resampled.
+scipy.interpolate is slow to import, and is loaded only where a grid is resampled.
 """
 
 import numpy as np

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...machine_code import Kept, compiled, fingerprint, kept, row_major
+from ...machine_code import Kept, compiled, fingerprint, kept
 
 MISFIT = 0.02
 """Of the residual's variance, what differs from image to image besides noise: most of it is the model's, in all."""
@@ -275,7 +275,7 @@ def _constants(fit: Any) -> Constants:
     columns = fit.stride, fit.corner, fit.sharpness[:, None], fit.unit, fit.fall, fit.ring, fit.size[:, None]
     ones, offsets = fit.linear[:1], fit.linear[1:]
     wide = -offsets.shape[1] % LANES
-    constants = Constants(
+    return Constants(
         level=fit.stride[:, 0].log2().round().long().numpy(),
         limit=fit.limit.float().numpy(),
         scales=torch.cat(columns, 1).numpy(),
@@ -286,4 +286,3 @@ def _constants(fit: Any) -> Constants:
         farthest=fit.farthest[:, :, 0, 0].contiguous().numpy(),
         numbers=np.array([fit.half_width, MISFIT, fit.narrowness], np.float32),
     )
-    return row_major(constants)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...machine_code import Kept, compiled, fingerprint, kept, row_major, takes
+from ...machine_code import Kept, compiled, fingerprint, kept, takes
 
 
 @compiled
@@ -137,5 +137,5 @@ def found_by(function: Any, constants: tuple[Tensor, ...], given: tuple[Tensor, 
     found = given[0].new_empty(frames, *shape)
     with KEPT_STEPS[function].compiling(np.dtype(np.float32)):
         each = (value.expand(frames, *value.shape[1:]).contiguous().numpy() for value in given)
-        function(row_major(tuple(value.numpy() for value in constants)), *each, found.numpy())
+        function(tuple(value.numpy() for value in constants), *each, found.numpy())
     return found

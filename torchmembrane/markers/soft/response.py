@@ -56,9 +56,9 @@ class DotResponse(nn.Module):
     The scale is `radius / 2^0.5`, where the response to a disc is largest. A pattern of two sizes has two scales about each
     place: of the other size's response as much is taken off as makes this one vanish at its dots.
 
-    radii: radii of the dots, `[D]`, px.
+    Args:
+        radii: radii of the dots, `[D]`, px.
         others: radii of dots of the other size at the same places, `[D]`, px; NaN if there is one size only.
-        others: radii that dots of the other size have there `[D]`, px; NaN where there is one size only.
         coarser: number of pyramid levels above the coarsest that still shows a dot's shape (negative: below).
         reach: half side of the windows, `[D]`, px.
         inside: `[1, 1, H, W]`, 1 on the membrane, else 0: pixels outside have zero weight in the Gaussians.

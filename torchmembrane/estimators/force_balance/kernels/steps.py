@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ....machine_code import Kept, fingerprint, kept, row_major
+from ....machine_code import Kept, fingerprint, kept
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
 from ....mechanics.native_membrane import Surface, surface_of
@@ -161,7 +161,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         return np.ascontiguousarray(values.numpy(), dtype)
 
     surroundings, wider = array(loss.surroundings), array(loss.wider)
-    constants = Constants(
+    return Constants(
         surface,
         array(loss.area),
         surroundings,
@@ -176,7 +176,6 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         bearings.nearest.numpy(),
         numbers,
     )
-    return row_major(constants)
 
 
 def _nothing(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +194,7 @@ def _volume(surface: Surface) -> float:
 def _sparse(rows: np.ndarray, count: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Numbers and values of what is not zero in each row, `[D, K]` each, then some that are."""
     count = count or int((rows != 0).sum(1).max())
-    numbers = np.argsort(rows == 0, axis=1, kind="stable")[:, :count]
+    numbers = np.ascontiguousarray(np.argsort(rows == 0, axis=1, kind="stable")[:, :count])
     return numbers, np.take_along_axis(rows, numbers, 1)
 
 
