@@ -139,8 +139,7 @@ def quintics(low: float, rounding: float) -> list[tuple[float, float, float]]:
 
 
 def _nearest_to_one(low: float, high: float) -> tuple[float, float, float, float]:
-    """Return the coefficients `a, b, c` of the odd quintic that is closest to 1 between `low` and `high`, and its largest
-    error.
+    """Return the coefficients `a, b, c` and the largest error of the odd quintic that is closest to 1 from `low` to `high`.
 
     The errors at both ends and at the two extrema between them are equal, with alternating signs (Remez). If the interval is
     shorter than `NARROW`, it is the quintic whose first and second derivatives vanish at 1.

@@ -66,8 +66,7 @@ class StencilSystem(nn.Module):
         """Assemble `A^T W A` plus further blocks.
 
         Args:
-            stencils: `A [B, 3, 3, 7, N]`, the derivatives of three values per vertex in the unknowns of the vertices of its
-                stencil.
+            stencils: `A [B, 3, 3, 7, N]`, derivatives of three values per vertex in the unknowns of its stencil's vertices.
             weights: symmetric weights `W [B, 3, 3, N]`.
             near: further blocks between the vertices and their neighbours at the first `K` of `OFFSETS`, `[B, 3, 3, K, N]`.
             damping: relative increase of the diagonal.
