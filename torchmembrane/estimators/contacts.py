@@ -126,15 +126,13 @@ def bulge_inwards(x: Tensor, normals: Tensor, membrane: Membrane) -> Tensor:
 
 
 def bulge_regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:
-    """Return the region number of each vertex, `[B, V]`, 0 for none: at most `count` regions of `bulge [B, V]`, strongest
-    first."""
+    """Return the region number of each vertex, `[B, V]`, 0 for none, from `bulge [B, V]`: the strongest `count` regions."""
     on_grid = bulge.float().unflatten(-1, membrane.grid)  # single precision is enough to compare heights
     return persistent_regions(on_grid, count, LEAST_BULGE * membrane.size).flatten(1)
 
 
 def region_centroids(x: Tensor, region: Tensor, weight: Tensor, membrane: Membrane, count: int) -> Tensor:
-    """Return the centroids `[B, count, 3]` of numbered regions of `x [B, V, 3]`, weighted by `weight [B, V]`; NaN if
-    missing."""
+    """Return the centroids `[B, count, 3]` of numbered regions of `x [B, V, 3]`, weighted by `weight [B, V]`; NaN if none."""
     weight = weight * membrane.rest_area
     numbers = torch.arange(1, count + 1, device=x.device)
     weight = weight[:, None] * (region[:, None] == numbers[:, None])
