@@ -19,8 +19,8 @@ def check_precision(dtype: torch.dtype) -> None:
     """Refuse a precision other than float32 and float64."""
     if dtype not in PRECISIONS:
         raise MembraneError(
-            f"Reconstructor: in {dtype} the solve loses the answer; expected torch.float32 or torch.float64: call .float() "
-            "(images may be of half precision)"
+            f"Reconstructor: {dtype} is not accurate enough for the solver; expected torch.float32 or torch.float64: call "
+            ".float() (images may have half precision)"
         )
 
 

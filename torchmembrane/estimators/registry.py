@@ -88,7 +88,7 @@ def check_protocol(kind: Any, given: str) -> None:
     if settings is not None and not getattr(getattr(settings, "__dataclass_params__", None), "frozen", False):
         lacking.append("@dataclass(frozen=True) at Settings")
     if lacking:
-        raise MembraneError(f"{given} lacks {', '.join(lacking)}; see torchmembrane.Estimator for what an estimator defines")
+        raise MembraneError(f"{given} lacks {', '.join(lacking)}; see torchmembrane.Estimator for what a subclass must define")
 
 
 def refuse_unfit(sensor: Sensor, name: str, kind: type[Estimator]) -> None:
@@ -141,7 +141,7 @@ def _named(name: str) -> type[Estimator]:
         raise MembraneError(f"estimator {name!r}: installed packages have {', '.join(sorted(values))}; expected MODULE:CLASS")
     if not values:
         names = list(dict.fromkeys([*ESTIMATORS, *sorted(point.name for point in points)]))
-        meant = did_you_mean(name, names, "`register_estimator` gives a class a name")
+        meant = did_you_mean(name, names, "`register_estimator` adds a class under a name")
         raise MembraneError(f"Reconstructor: estimator = {name!r}; expected one of {', '.join(names)} or MODULE:CLASS; {meant}")
     register_estimator(name, _imported(values.pop()))
     return ESTIMATORS[name]

@@ -77,6 +77,6 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         raise MembraneError(
-            "second derivatives of a reconstruction: its solves are differentiated once; expected first ones: leave out "
-            "create_graph, or take finite differences of the gradient"
+            "second derivatives of a reconstruction: its solves can only be differentiated once; expected first ones: leave "
+            "out create_graph, or take finite differences of the gradient"
         )

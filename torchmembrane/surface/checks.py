@@ -88,7 +88,7 @@ def checked_orientation(X: np.ndarray, triangles: np.ndarray, fixed: np.ndarray)
     if hidden.any():
         k = np.flatnonzero(free)[np.flatnonzero(hidden)[0]]
         raise MembraneError(
-            f"Membrane: {hidden.sum()} of {free.sum()} triangles turn their outside to the camera, the first one at vertices "
-            f"{triangles[k].tolist()}; expected a grid without folds whose inside is seen from the camera everywhere"
+            f"Membrane: {hidden.sum()} of {free.sum()} triangles show the camera their outer side, the first one at vertices "
+            f"{triangles[k].tolist()}; expected a grid without folds whose inner side is visible to the camera everywhere"
         )
     return outward

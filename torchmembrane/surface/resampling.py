@@ -30,7 +30,7 @@ def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> t
         MembraneError: the given grid has fewer than 4 lines in a direction.
     """
     if min(X.shape[:2]) < FEWEST:
-        raise MembraneError(f"Membrane: {X.shape[0]} x {X.shape[1]} lines; expected at least {FEWEST} each way to interpolate")
+        raise MembraneError(f"Membrane: {X.shape[0]} x {X.shape[1]} lines; expected at least {FEWEST} in each direction")
     lines = even_lines(X, grid[0]), even_lines(X.swapaxes(0, 1), grid[1])
     vertices = on_lines(X, lines)
     rows, columns = (np.rint(line[1:-1]).clip(1, count - 2).astype(int) for line, count in zip(lines, X.shape[:2], strict=True))

@@ -16,8 +16,8 @@ def refuse_open(filling: str) -> None:
     """Refuse a gauge for an open cavity, whose pressure is known."""
     if filling == "open":
         raise MembraneError(
-            "pressure: the cavity is open, its pressure is known to stay at rest: a gauge tells nothing; leave it out, or "
-            "describe the cavity as a liquid or a gas"
+            "pressure: the cavity is open, so its pressure stays at rest and a gauge adds nothing; leave it out, or describe "
+            "the cavity as a liquid or a gas"
         )
 
 
@@ -35,9 +35,9 @@ def gauge_reading(pressure: Tensor | float, rest_pressure: Tensor, deviation: fl
     """
     read, frames = torch.as_tensor(pressure).to(confidence), len(confidence)
     if read.shape not in ((), (frames,)):
-        raise MembraneError(f"pressure {list(read.shape)}; expected [{frames}], one reading for each frame, NaN where none is")
+        raise MembraneError(f"pressure {list(read.shape)}; expected [{frames}], one reading per frame, NaN if there is none")
     if can_sync(read) and bool(read.isinf().any()):
-        raise MembraneError("pressure: inf; expected force / length^2 across the membrane, NaN where there is no reading")
+        raise MembraneError("pressure: inf; expected force / length^2 across the membrane, NaN if there is no reading")
     known = read.isfinite().expand(frames)
     change = torch.where(known, read - rest_pressure, 0.0)
     return torch.stack([change, known.to(change) / deviation**2], -1)

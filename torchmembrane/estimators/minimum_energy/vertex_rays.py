@@ -72,7 +72,7 @@ class VertexRays(Estimator):
         """Return the rays of the grid's vertices, moved by the flow of the markers at `pixels [B, D, 2]`, with equal noise."""
         if self.flow is None:
             raise MembraneError(
-                f"{type(self).__name__}.prepare: made without a flow; pass flow, or give forward the vertices' rays"
+                f"{type(self).__name__}.prepare: there is no flow; pass flow, or call forward with the vertices' rays"
             )
         return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
 

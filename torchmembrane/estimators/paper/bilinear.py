@@ -72,7 +72,7 @@ def _cells(points: np.ndarray) -> list[list[int]]:
         mesh = Delaunay(points)
     except Exception as error:
         raise MembraneError(
-            f"bilinear_matrix: the markers cannot be triangulated ({error}); expected them spread out"
+            f"bilinear_matrix: the markers cannot be triangulated ({error}); expected markers that are not all on one line"
         ) from error
     pairs = []
     for k, triangle in enumerate(mesh.simplices):

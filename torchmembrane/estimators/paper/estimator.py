@@ -102,7 +102,7 @@ class PaperSettings:
             raise MembraneError(f"PaperSettings: flow = {self.flow!r}; expected one of {', '.join(FLOWS)}")
         if not self.smoothing > 0:
             raise MembraneError(
-                f"PaperSettings: smoothing = {self.smoothing}; expected more than 0: the element is blind to the hourglass mode"
+                f"PaperSettings: smoothing = {self.smoothing}; expected more than 0: the element has no hourglass stiffness"
             )
         if self.rounds < 1:
             raise MembraneError(f"PaperSettings: rounds = {self.rounds}; expected at least 1")
