@@ -187,7 +187,7 @@ class Estimator(nn.Module, ABC):
         takes_heights: whether it accepts markers at a distance from the surface (`Problem.levers`).
         in_parts: whether `forward` is composed of methods marked `control_flow.traced`. Any other `forward` is exported as one
             part, which must consist of torch operations that ONNX supports.
-        name: name under which `Reconstructor` was asked for the estimator; `Reconstructor` sets it.
+        name: name by which the estimator was chosen; `Reconstructor` sets it.
 
     Example:
         >>> from dataclasses import dataclass

@@ -20,7 +20,7 @@ ESTIMATORS: dict[str, type[Estimator]] = {
     "paper": PaperEstimator,
 }
 PROTOCOL = ("Settings", "from_problem", "prepare", "forward", "is_converged")
-"""What a subclass of `Estimator` must define."""
+"""Members that a subclass of `Estimator` must define."""
 
 
 def register_estimator(name: str, kind: type[Estimator]) -> None:

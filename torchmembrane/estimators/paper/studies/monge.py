@@ -140,8 +140,8 @@ class MongeMinimumEnergy(nn.Module):
         steepness = torch.linalg.cross(edges[..., 0, :], edges[..., 1, :]).norm(dim=-1) / 2 / footprint
         if ((footprint <= 0) | (steepness > STEEPEST)).any():
             raise MembraneError(
-                f"MongeMinimumEnergy: a triangle is {float(steepness.abs().max()):.3g} times its footprint, or folded; expected "
-                f"a graph over the x, y plane, at most {STEEPEST:.3g} times: use MinimumEnergy, whose unknowns are ranges"
+                f"MongeMinimumEnergy: a triangle is {float(steepness.abs().max()):.3g} times its footprint, or folded; "
+                f"expected a graph over the x, y plane, at most {STEEPEST:.3g} times; or use MinimumEnergy, with ranges"
             )
         self.rest_plane = torch.linalg.inv(plane)
         self.rest_slope = (self.rest_plane @ edges[..., 2:]).squeeze(-1)
