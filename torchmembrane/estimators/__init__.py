@@ -1,1 +1,1 @@
-"""From marker rays to the surface."""
+"""Estimators, which reconstruct the surface from the rays of the markers."""

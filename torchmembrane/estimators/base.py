@@ -1,4 +1,5 @@
-"""What an estimator is: what it is built from, what it is given, what it finds, and what its class has to say."""
+"""The base class of estimators, what they are built from (`Problem`), what they take (`Observation`) and return
+(`Equilibrium`)."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple, Self
@@ -18,22 +19,21 @@ from .contacts import ContactPatches, Contacts
 
 
 class Problem(NamedTuple):
-    """One sensor, as an estimator is built from it; tensors are in double precision.
+    """Description of a sensor from which an estimator is built; tensors are in double precision.
 
-    camera           the camera
+    camera           the camera; a `Rig` if there are several views
     membrane         the rest surface on the solver's grid
     elasticity       the elastic energy of the membrane
-    filling          of the cavity: "liquid", "gas" or "open"
-    gas              of a gas: its absolute pressure at rest, force / length^2, and its volume, length^3; else None
-    markers          the markers as points of the rest surface's triangles
+    filling          filling of the cavity: "liquid", "gas" or "open"
+    gas              absolute pressure at rest, force / length^2, and volume, length^3, of a gas; else None
+    markers          the markers as points on the rest surface's triangles
     positions        [D, 3]  rest positions of the markers on the surface, length unit
-    rest_pixels      [D, 2]  where the camera model sees the markers at rest, px
-    vertex_pixels    [V, 2]  where the camera model sees the grid's vertices at rest, px
-    rest_covariance  [D, 2, 2]  px^2, noise of the markers' displacements in a frame like the rest image
-    rest_confidence  [D]  1 of markers whose rays at rest count, 0 of others; None: all count
-    views            W, how many views see the markers: each marker is then listed once for each view, D is all of these, and
-                     the camera is a `Rig`
-    levers           [D, 3]  from the positions to what the camera sees of the markers at rest; None: they lie on the surface
+    rest_pixels      [D, 2]  pixels of the markers at rest according to the camera model
+    vertex_pixels    [V, 2]  pixels of the grid's vertices at rest according to the camera model
+    rest_covariance  [D, 2, 2]  covariance of the markers' measured displacements in a frame like the rest image, px^2
+    rest_confidence  [D]  1 for markers whose rays at rest are used, 0 for others; None: all are used
+    views            W, the number of views that see the markers; each marker is listed once for each view, and D counts all
+    levers           [D, 3]  vectors from the positions to the visible points of the markers at rest; None: they coincide
     """
 
     camera: Camera | Rig
@@ -51,21 +51,21 @@ class Problem(NamedTuple):
     levers: Tensor | None = None
 
     def cavity_law(self) -> CavityLaw:
-        """What the fluid asks of the enclosed volume; the rest pressure is the one that balances the membrane's tension."""
+        """Return the law of the cavity's filling; the rest pressure balances the membrane's tension."""
         return CavityLaw(self.membrane, rest_balance(self.membrane, self.elasticity)[0], self.filling, self.gas)
 
 
 class Observation(NamedTuple):
-    """Measured rays of a batch, of the markers or of the grid's vertices, as an estimator's `prepare` makes them.
+    """Measured rays of a batch, of the markers or of the grid's vertices, from an estimator's `prepare`.
 
-    origins     [B, N, 3]  of the rays, length unit
-    directions  [B, N, 3]  of the rays, unit vectors
-    confidence  [B, D]  of the markers, 0 for a lost one, else up to 1
-    across      [B, N, 2, 3]  two vectors across each ray: the ray's turn along them counts in standard deviations of its
-                marker; None: all rays are as sure in all directions
-    motion      [B, N, 2, 4 W]  by how much of these a moved camera turns the ray, as `marker_residuals.marker_rays` gives it;
+    origins     [B, N, 3]  origins of the rays, length unit
+    directions  [B, N, 3]  unit directions of the rays
+    confidence  [B, D]  confidence of the markers, 0 for a lost one, else up to 1
+    across      [B, N, 2, 3]  two vectors orthogonal to each ray, scaled such that angles along them are in standard deviations
+                of the marker; None: the noise is the same for all rays and directions
+    motion      [B, N, 2, 4 W]  derivatives of these angles in the motion of the camera, from `marker_residuals.marker_rays`;
                 None: the camera has not moved
-    gauge       [B, 2]  what a pressure gauge reads, as `pressure_gauge.gauge_reading` gives it; None: there is no gauge
+    gauge       [B, 2]  reading of a pressure gauge, from `pressure_gauge.gauge_reading`; None: there is no gauge
     """
 
     origins: Tensor
@@ -76,24 +76,24 @@ class Observation(NamedTuple):
     gauge: Tensor | None = None
 
     def to(self, dtype: torch.dtype) -> "Observation":
-        """The same in another precision."""
+        """Return the observation in another precision."""
         return self._replace(**{name: value.to(dtype) for name, value in self._asdict().items() if value is not None})
 
 
 class Equilibrium(NamedTuple):
-    """What an estimator finds in a batch. An estimator that finds no tractions makes one by `without_tractions`.
+    """Solution of an estimator for a batch. An estimator without tractions builds it by `without_tractions`.
 
     vertices       [B, V, 3]  the surface, length unit, camera frame
     pressure       [B]  pressure difference across the membrane, force / length^2
-    volume         [B]  under the surface, length^3
-    traction       [B, V, 3]  contact force per rest area; zero where none is found, as all below but `relative_step`
-    relative_step  [B]  the solve's last step over the surface's size
-    reference      [B, V]  the traction that pushes are measured against
+    volume         [B]  volume under the surface, length^3
+    traction       [B, V, 3]  contact force per rest area; zero without tractions, like all following fields but `relative_step`
+    relative_step  [B]  last step of the solver, relative to the surface's size
+    reference      [B, V]  traction with which a vertex's compressive traction is compared
     misfit         [B]  rms of the angles between markers and their rays, in standard deviations
-    moved          [B, 4 W]  motion of each of the W views' cameras against the rim
-    objective      [B]  what the solve minimises, over the number of markers seen
-    unexplained    [B]  the part of it that no push explains: misfit, pulls and shear
-    pushed         [B]  share of the surface that something pushes
+    moved          [B, 4 W]  motion of the camera of each of the W views relative to the rim
+    objective      [B]  value of the objective function, per marker seen
+    unexplained    [B]  the objective without the normal-compression term: misfit, normal tension and shear
+    pushed         [B]  share of the surface under compressive traction
     shared_misfit  [B]  the part of the misfit that neighbouring markers have in common
     """
 
@@ -112,13 +112,13 @@ class Equilibrium(NamedTuple):
 
     @classmethod
     def without_tractions(cls, x: Tensor, pressure: Tensor, volume: Tensor, step: Tensor) -> "Equilibrium":
-        """Of an estimator that finds no tractions: all that they tell is zero.
+        """Return a solution without tractions: all fields that depend on them are zero.
 
         Args:
             x: the surface, `[..., V, 3]`.
-            pressure: `[...]`.
-            volume: `[...]`.
-            step: the last step over the surface's size, `[...]`; zero where nothing is iterated.
+            pressure: pressure difference across the membrane, `[...]`.
+            volume: volume under the surface, `[...]`.
+            step: last step relative to the surface's size, `[...]`; zero if the estimator does not iterate.
         """
         none = torch.zeros_like(x)
         zero, still = none[..., 0, 0], none[..., :4, 0]
@@ -128,8 +128,8 @@ class Equilibrium(NamedTuple):
 class Deviations(NamedTuple):
     """Standard deviations that are reported with every frame; NaN where they are not known.
 
-    force  [B, 3]  of the total force
-    depth  [B]  of the deepest displacement along the rest normal, length unit
+    force  [B, 3]  standard deviation of the total force
+    depth  [B]  standard deviation of the largest displacement along the inward rest normal, length unit
     """
 
     force: Tensor
@@ -137,58 +137,57 @@ class Deviations(NamedTuple):
 
     @classmethod
     def unknown(cls, found: Equilibrium) -> "Deviations":
-        """NaN for every frame."""
+        """Return NaN for every frame."""
         force = torch.full_like(found.vertices[:, 0], torch.nan)
         return cls(force, force[:, 0])
 
     def calibrated(self, force: Tensor, uncertainty: float | None) -> "Deviations":
-        """With that of the scale of all forces, relative, by the calibration of the material; None: not known.
+        """Return the deviations with the uncertainty of the material's calibration added to that of the force.
 
         Args:
-            force: `[B, 3]`, as found.
-            uncertainty: as in the sensor's record.
+            force: total force found, `[B, 3]`.
+            uncertainty: relative uncertainty of the scale of all forces, from the sensor's record; None: not known.
         """
         return self._replace(force=torch.hypot(self.force, uncertainty * force)) if uncertainty else self
 
 
 class StandardDeviations(NamedTuple):
-    """Of `vertices [B, V, 3]` (zero where fixed), total `force [B, 3]` and `pressure [B]`."""
+    """Standard deviations of the `vertices [B, V, 3]` (zero where fixed), total `force [B, 3]` and `pressure [B]`."""
 
     vertices: Tensor
     force: Tensor
     pressure: Tensor
 
     def known(self, frames: Tensor) -> "StandardDeviations":
-        """The same, NaN but in `frames [B]`, bool."""
+        """Return the deviations, with NaN in place of those outside `frames [B]`, bool."""
         rows = ((value, frames.reshape(-1, *(1,) * (value.ndim - 1))) for value in self)
         return StandardDeviations(*(torch.where(row, value, torch.nan) for value, row in rows))
 
 
 class Estimator(nn.Module, ABC):
-    """From what the markers of a sensor show to its surface: the base of every estimator, also of your own.
+    """Base class of estimators, which reconstruct the surface of a sensor from its markers. Subclass it to write your own.
 
     A subclass defines `Settings`, `from_problem`, `prepare`, `forward` and `is_converged`; everything else has a default. It
-    works on batches and is differentiable. Tensors of the sensor are buffers, in double precision when it is built, so that
-    they change precision and device with the module; a `state_dict` leaves them out, as they are rebuilt from the sensor, and
-    keeps parameters.
+    works on batches and is differentiable. The sensor's tensors are buffers, in double precision when it is built, so that they
+    change precision and device with the module. A `state_dict` contains parameters, but not these buffers, because they are
+    rebuilt from the sensor.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        cavity: what the fluid asks of the volume; of a problem, `problem.cavity_law()`.
-        settings: default: those of `Settings()`.
-        spacing: spacing of the markers, length unit, where it limits what is known of contacts.
+        cavity: law of the cavity's filling, such as `problem.cavity_law()`.
+        settings: settings of the estimator; default `Settings()`.
+        spacing: spacing of the markers, length unit, if it limits the resolution of contacts.
 
     Attributes:
-        Settings: a frozen dataclass, of which every field has a default.
-        default_locator: how markers are found in images where nothing else is asked for: "fit" or "soft".
-        needs_every_vertex: whether every vertex of the grid must be seen by the camera at rest; a sensor of which that is not
-            true is refused.
+        Settings: a frozen dataclass whose fields all have defaults.
+        default_locator: locator of markers in images if none is chosen: "fit" or "soft".
+        needs_every_vertex: whether the camera must see every vertex of the grid at rest; other sensors are refused.
         finds_tractions: whether `forward` finds tractions, and with them forces.
-        takes_views: whether it can be given several views, as of `Problem.views`; refused otherwise.
-        takes_heights: whether it can be given markers that stand off the surface, as of `Problem.levers`; refused otherwise.
-        in_parts: whether `forward` is put together of methods marked `control_flow.traced`; an exported model holds any other
-            `forward` as one part, which must consist of torch operations that ONNX has.
-        name: the one by which it was asked for; set by `Reconstructor`.
+        takes_views: whether it accepts several views (`Problem.views`).
+        takes_heights: whether it accepts markers at a distance from the surface (`Problem.levers`).
+        in_parts: whether `forward` is composed of methods marked `control_flow.traced`. Any other `forward` is exported as one
+            part, which must consist of torch operations that ONNX supports.
+        name: name by which the estimator was chosen; `Reconstructor` sets it.
 
     Example:
         >>> from dataclasses import dataclass
@@ -237,26 +236,26 @@ class Estimator(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def from_problem(cls, problem: Problem, settings: Any = None) -> Self:
-        """The estimator of a sensor; `settings`: an instance of `Settings`, None: its defaults."""
+        """Build the estimator for a sensor; `settings` is an instance of `Settings`, or None for the defaults."""
 
     @abstractmethod
     def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
-        """The rays that `forward` needs.
+        """Return the rays that `forward` needs.
 
         Args:
-            camera: the sensor's `Camera`; of several views a `Rig`.
-            pixels: pixels of the markers, `[B, D, 2]`; those of a lost one mean nothing.
+            camera: the sensor's `Camera`, or a `Rig` of several views.
+            pixels: pixels of the markers, `[B, D, 2]`; those of lost markers are arbitrary.
             confidence: confidence of the markers, `[B, D]`, 0 for a lost one.
-            covariance: covariance of the pixels, `[B, D, 2, 2]` px^2, with the model's own error.
+            covariance: covariance of the pixels including the model's own error, `[B, D, 2, 2]` px^2.
         """
 
     @abstractmethod
     def forward(self, observation: Observation) -> Equilibrium:
-        """The surface."""
+        """Reconstruct the surface."""
 
     @abstractmethod
     def is_converged(self, found: Equilibrium) -> Tensor:
-        """Which frames' solutions are final, `[B]` bool; the others get the status `NOT_CONVERGED`."""
+        """Return which frames have converged, `[B]` bool; the others get the status `NOT_CONVERGED`."""
 
     @property
     def rest_pressure(self) -> Tensor:
@@ -265,62 +264,64 @@ class Estimator(nn.Module, ABC):
 
     @property
     def must_compile(self) -> bool:
-        """Whether the first frame waits for machine code to be compiled; default: no."""
+        """Whether the first frame has to wait until machine code is compiled; default: no."""
         return False
 
     @property
     def solves_in_double(self) -> bool:
-        """Whether this sensor must be solved in double precision, whatever the results are in; default: no."""
+        """Whether this sensor must be solved in double precision, whatever the precision of the results; default: no."""
         return False
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """Which frames' markers move as a surface of this sensor can, `[B]` bool; the others get the status `UNEXPLAINED`.
-        Default: all."""
+        """Return in which frames a surface of this sensor explains the markers, `[B]` bool; default: all without NaN.
+
+        The other frames get the status `UNEXPLAINED`.
+        """
         return ~found.misfit.isnan()
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
-        """Where something touches; default: where the surface lies inside the rest surface (section 5.1).
+        """Return the contacts; default: where the surface lies inside the rest surface (section 5.1).
 
         Args:
-            found: by `forward`.
-            normals: normals of the surface, outward unit vectors `[B, V, 3]`.
+            found: result of `forward`.
+            normals: outward unit normals of the surface, `[B, V, 3]`.
         """
         return self.patches.bulges(found.vertices, normals, found.traction if self.finds_tractions else None)
 
     def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
-        """How far off force and depth may be; default: not known, NaN."""
+        """Return the standard deviations of force and depth; default: unknown, NaN."""
         return Deviations.unknown(found)
 
     def check_gauge(self) -> None:
-        """Refuse a measured pressure where it tells this estimator nothing; default: always.
+        """Refuse a measured pressure if this estimator cannot use it; default: always.
 
         Raises:
-            MembraneError: a measured pressure tells nothing.
+            MembraneError: a measured pressure is of no use.
         """
         raise self._without("pressure for")
 
     def gauged(self, observation: Observation, pressure: Tensor | float) -> Observation:
-        """The observation with the pressure that a gauge reads, `[B]` or `[]`, NaN where there is no reading; default: refused.
+        """Add the pressure read by a gauge to the observation, `[B]` or `[]`, NaN without a reading; default: refused.
 
         Raises:
-            MembraneError: as of `check_gauge`, or a pressure of another shape.
+            MembraneError: as for `check_gauge`, or the pressure has another shape.
         """
         raise self._without("pressure for")
 
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: Tensor
     ) -> StandardDeviations:
-        """Standard deviations that the markers' noise causes in a solution; default: refused.
+        """Return the standard deviations of a solution due to the markers' noise; default: refused.
 
         Args:
             x: the surface found, `[B, V, 3]`.
-            pressure: found, `[B]`.
-            moved: motion of the cameras found, `[B, 4 W]`.
-            observation: that it was found from.
-            marker_noise: `[B, D, 2, 3]`, how noise in each of two independent directions turns the markers' rays.
+            pressure: the pressure found, `[B]`.
+            moved: the camera motions found, `[B, 4 W]`.
+            observation: the rays that the solution was found from.
+            marker_noise: changes of the rays' directions due to two independent components of noise, `[B, D, 2, 3]`.
 
         Raises:
-            MembraneError: this estimator knows none.
+            MembraneError: this estimator has no standard deviations.
         """
         raise self._without("standard deviations of")
 
@@ -329,20 +330,20 @@ class Estimator(nn.Module, ABC):
 
     @property
     def element(self) -> str:
-        """The finite element, as `mesh.npz` names it; default: that of the settings, else "triangle"."""
+        """Name of the finite element in `mesh.npz`; default: that of the settings, else "triangle"."""
         return str(getattr(self.settings, "element", "triangle"))
 
     @property
     def volume(self) -> str:
-        """Name of the volume constraint in `mesh.npz`; default: that of the settings, or "exact"."""
+        """Name of the volume constraint in `mesh.npz`; default: that of the settings, else "exact"."""
         return str(getattr(self.settings, "volume", "exact"))
 
     @property
     def flow_kind(self) -> str:
-        """The flow between the markers, as `mesh.npz` names it; default: that of the settings, else "smooth"."""
+        """Name of the flow interpolation between the markers in `mesh.npz`; default: that of the settings, else "smooth"."""
         return str(getattr(self.settings, "flow", "smooth"))
 
     @property
     def smoothing_weight(self) -> float:
-        """The smoother's weight, as `mesh.npz` has it; default: that of the settings, else 0."""
+        """Weight of the smoother in `mesh.npz`; default: that of the settings, else 0."""
         return float(getattr(self.settings, "smoothing", 0.0))

@@ -1,10 +1,10 @@
-"""Contact patches: where something pushes, the patches' centroids, and what each tells of what touches.
+"""Contact patches: their location, force, normal, area, slip ratio and curvature.
 
-A patch of tractions is what lies around a peak of the smoothed push that stands for itself, however weak it is beside the
-others. Every vertex belongs to the patch whose peak is nearest to it on the rest surface, with all of its traction: the
-patches' forces add up to the total force, also where the estimate smears a push over the contact's edge.
+A patch is the surroundings of a persistent peak of the smoothed compressive traction, called the push. Every vertex belongs,
+with all of its traction, to the patch whose peak is nearest on the rest surface. So the forces of the patches add up to the
+total force, even where the estimate smears a push over the edge of the contact.
 
-Where no tractions are known, a contact is a region of the surface that lies inside the rest surface.
+If no tractions are known, a contact is a region of the surface that lies inside the rest surface.
 """
 
 from typing import NamedTuple
@@ -21,39 +21,40 @@ from .native_contacts import NativePatches
 from .regions import persistent_peaks, persistent_regions
 
 CONTACT_POINTS = 4
-"""Contacts that are reported at most."""
+"""Largest number of contacts that are reported."""
 LEAST = 0.03
-"""Smallest peak of the smoothed push that is a patch of its own, over the highest."""
+"""Smallest peak of the smoothed push that forms its own patch, relative to the highest peak."""
 APART = 0.3
-"""By how much of itself a peak stands above the pass to a higher one, if it is a patch of its own."""
+"""Smallest prominence of a peak that forms its own patch, relative to its height: its height above the pass to a higher
+peak."""
 PUSHED = 0.5
 """Indicator above which a vertex is in contact."""
 RIM = 0.1
-"""Over the surface's size: a push within it, or within the markers' spacing, of the rim may go on beyond the rim."""
+"""Relative to the surface's size: a push closer to the rim than this, or than the markers' spacing, may continue beyond it."""
 RIM_SHARE = 0.05
-"""Share of a patch's push there, above which the patch may reach the rim."""
+"""Share of a patch's push so close to the rim, above which the patch may reach the rim."""
 BESIDE = 0.06
-"""Over the surface's size: so near the rim a body that reaches it has moved the surface."""
+"""Relative to the surface's size: distance from the rim within which a body that reaches the rim has displaced the surface."""
 MOVED = 0.225
-"""Displacement there over the largest of all, above which the patch may reach the rim: it does if both say so."""
+"""Displacement at this distance, relative to the largest of all, above which the patch may reach the rim. A patch reaches the
+rim if both this and `RIM_SHARE` are exceeded."""
 LEAST_STEPS = 2.0
-"""Grid steps that a patch spans at least where curvatures are told."""
+"""Smallest diameter of a patch whose curvatures are reported, in grid steps."""
 LEAST_BULGE = 1e-3
-"""Over the surface's size: the smallest displacement into the rest surface that is a contact of its own."""
+"""Smallest displacement into the rest surface that forms its own contact, relative to the surface's size."""
 
 
 class Contacts(NamedTuple):
-    """Where something touches in a batch, and what that tells: of P = 4 contacts, the strongest first, NaN where there are
-    fewer.
+    """Contacts of a batch: P = 4 for each frame, the strongest first, NaN if there are fewer.
 
-    indicator  [B, V]  how surely each vertex is touched, 0..1
+    indicator  [B, V]  contact indicator of each vertex, 0..1
     points     [B, P, 3]  centroids of the contacts, length unit
-    force      [B, P, 3]  on the membrane; NaN where no tractions are found
-    normal     [B, P, 3]  mean outward normal of the membrane there
-    area       [B, P]  length^2
-    slip       [B, P]  shear force over normal force; NaN where no tractions are found
-    curvature  [B, P, 2]  principal curvatures of the surface there, positive where the object bulges into the membrane
-    at_rim     [B, P]  1 where the contact reaches the rim, else 0
+    force      [B, P, 3]  forces on the membrane; NaN if no tractions are found
+    normal     [B, P, 3]  mean outward normals of the membrane in the contacts
+    area       [B, P]  areas of the contacts, length^2
+    slip       [B, P]  ratio of shear force to normal force; NaN if no tractions are found
+    curvature  [B, P, 2]  principal curvatures of the surface, positive where the object bulges into the membrane
+    at_rim     [B, P]  1 if the contact reaches the rim, else 0
     """
 
     indicator: Tensor
@@ -67,18 +68,18 @@ class Contacts(NamedTuple):
 
 
 def contact_indicator(traction: Tensor, normals: Tensor, reference: float | Tensor) -> Tensor:
-    """How surely a vertex is pushed: `s / (s + reference / 2)` of the compressive normal traction `s`.
+    """Return the contact indicator `s / (s + reference / 2)` of the compressive normal traction `s`.
 
-    A convex rigid body pushes with at least the fluid's pressure: at a contact the indicator is above 2/3, if the reference is
-    the rest pressure.
+    A convex rigid body pushes with at least the fluid's pressure. If the reference is the rest pressure, the indicator at a
+    contact is therefore above 2/3.
 
     Args:
-        traction: `[B, V, 3]`.
-        normals: outward, `[B, V, 3]`.
-        reference: force / length^2, a number or `[B, V]`.
+        traction: contact tractions, `[B, V, 3]`.
+        normals: outward normals, `[B, V, 3]`.
+        reference: reference traction, force / length^2, a number or `[B, V]`.
 
     Returns:
-        `[B, V]` in 0..1.
+        The indicator `[B, V]`, in 0..1.
 
     Example:
         >>> outward = torch.tensor([[[0.0, 0.0, 1.0]]])
@@ -90,19 +91,19 @@ def contact_indicator(traction: Tensor, normals: Tensor, reference: float | Tens
 
 
 def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, peaks: Tensor) -> tuple[Tensor, Tensor]:
-    """Force-weighted centroids of the contact patches, and whose every vertex is.
+    """Return the force-weighted centroids of the contact patches, and which vertices belong to each.
 
     A vertex belongs to the patch whose peak is nearest at rest.
 
     Args:
-        vertices: deformed, `[B, V, 3]`.
-        rest: `[V, 3]`.
-        inward_force: `[B, V]`.
-        peaks: the vertex at which each patch is pushed most, `[B, P]` int64, -1 where there is none.
+        vertices: deformed vertices, `[B, V, 3]`.
+        rest: rest vertices, `[V, 3]`.
+        inward_force: inward normal force at each vertex, `[B, V]`.
+        peaks: vertex with the peak push of each patch, `[B, P]` int64, -1 if there is none.
 
     Returns:
-        `[B, P, 3]`, strongest first, NaN where there is none; and `[B, P, V]`, 1 where of all patches this is the nearest at
-        rest, else 0.
+        Centroids `[B, P, 3]`, the strongest patch first, NaN if there is none; and `[B, P, V]`, 1 where a vertex belongs to the
+        patch, else 0.
     """
     present = peaks >= 0
     distance2 = (rest[peaks.clamp_min(0)][:, :, None] - rest).square().sum(-1)
@@ -118,20 +119,20 @@ def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, peaks: 
 
 
 def bulge_inwards(x: Tensor, normals: Tensor, membrane: Membrane) -> Tensor:
-    """How far a surface `x [B, V, 3]` with outward `normals [B, V, 3]` lies inside the rest surface, `[B, V]`, along the mean
-    of both normals."""
+    """Return the depth `[B, V]` of a surface `x [B, V, 3]` with outward `normals [B, V, 3]` inside the rest surface, measured
+    along the mean of both normals."""
     normal = torch.nn.functional.normalize(normals + membrane.rest_normals, dim=-1)
     return -((x - membrane.rest) * normal).sum(-1)
 
 
 def bulge_regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:
-    """Numbers of the regions `[B, V]`, 0 none, that stand out of `bulge [B, V]`, at most `count`, the strongest first."""
-    on_grid = bulge.float().unflatten(-1, membrane.grid)  # which of them is higher: single precision tells
+    """Return the region number of each vertex, `[B, V]`, 0 for none, from `bulge [B, V]`: the strongest `count` regions."""
+    on_grid = bulge.float().unflatten(-1, membrane.grid)  # single precision is enough to compare heights
     return persistent_regions(on_grid, count, LEAST_BULGE * membrane.size).flatten(1)
 
 
 def region_centroids(x: Tensor, region: Tensor, weight: Tensor, membrane: Membrane, count: int) -> Tensor:
-    """Centroids `[B, count, 3]` of numbered regions of `x [B, V, 3]`, weighted by `weight [B, V]`; NaN where there is none."""
+    """Return the centroids `[B, count, 3]` of numbered regions of `x [B, V, 3]`, weighted by `weight [B, V]`; NaN if none."""
     weight = weight * membrane.rest_area
     numbers = torch.arange(1, count + 1, device=x.device)
     weight = weight[:, None] * (region[:, None] == numbers[:, None])
@@ -140,11 +141,11 @@ def region_centroids(x: Tensor, region: Tensor, weight: Tensor, membrane: Membra
 
 
 class ContactPatches(nn.Module):
-    """What contact patches tell of the bodies that touch.
+    """Computes the contact patches of a membrane, with their forces and geometry.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        spacing: spacing of the markers on it, length unit; 0 where it does not limit what is resolved.
+        spacing: spacing of the markers on the surface, length unit; 0 if it does not limit the resolution.
     """
 
     near_rim: Tensor
@@ -157,15 +158,20 @@ class ContactPatches(nn.Module):
         self.least_span = max(LEAST_STEPS * membrane.size / ((m - 1) * (n - 1)) ** 0.5, spacing)
         from_rim = torch.cdist(membrane.rest, membrane.rest[membrane.fixed]).amin(1)
         beside = BESIDE * membrane.size
-        reach = torch.clamp(from_rim[~membrane.fixed].min(), min=beside)  # a coarse grid has no vertex as near
+        reach = torch.clamp(from_rim[~membrane.fixed].min(), min=beside)  # on a coarse grid all vertices are farther away
         self.register_buffer("near_rim", (from_rim < max(RIM * membrane.size, spacing)).double())
         self.register_buffer("beside_rim", (from_rim <= reach) * (beside / from_rim.clamp_min(beside)))
 
     def pushes(self, x: Tensor, normals: Tensor, traction: Tensor, reference: Tensor, surroundings: Tensor) -> Contacts:
-        """Where tractions push, and what that tells: a patch around every peak of the push that stands for itself.
+        """Return the contacts of a field of tractions: a patch around every persistent peak of the push.
 
-        `reference [B, V]` is what tractions are large beside, `surroundings [N, N]` has a mean over those around every inner
-        vertex in each column, by which the push is smoothed, twice; the others as below.
+        Args:
+            x: the surface, `[B, V, 3]`.
+            normals: outward normals, `[B, V, 3]`.
+            traction: contact force per rest area, `[B, V, 3]`.
+            reference: reference traction of the contact indicator, `[B, V]`.
+            surroundings: smoothing matrix of the push, which is applied twice, `[N, N]`; each column has the weights of a mean
+                around an inner vertex.
         """
         membrane, grid = self.membrane, self.membrane.grid
         if takes(x, normals, traction, reference) and x.dtype == surroundings.dtype == normals.dtype:
@@ -182,7 +188,8 @@ class ContactPatches(nn.Module):
         return contacts
 
     def bulges(self, x: Tensor, normals: Tensor, traction: Tensor | None = None) -> Contacts:
-        """Where a surface `x [B, V, 3]` lies inside the rest surface, with the forces of its `traction [B, V, 3]`, if known."""
+        """Return the regions where a surface `x [B, V, 3]` lies inside the rest surface as contacts; their forces follow from
+        the `traction [B, V, 3]`, if known."""
         bulge = bulge_inwards(x, normals, self.membrane)
         region = bulge_regions(bulge, self.membrane, CONTACT_POINTS)
         points = region_centroids(x, region, bulge.clamp_min(0), self.membrane, CONTACT_POINTS)
@@ -191,10 +198,10 @@ class ContactPatches(nn.Module):
     def of_regions(
         self, x: Tensor, normals: Tensor, region: Tensor, points: Tensor, traction: Tensor | None = None
     ) -> Contacts:
-        """Contacts that are numbered regions `[B, V]` with centroids `points [B, P, 3]`: the indicator is 1 in them, else 0."""
+        """Return numbered regions `[B, V]` with centroids `points [B, P, 3]` as contacts; the indicator is 1 inside, else 0."""
         indicator, numbers = (region > 0).to(x.dtype), torch.arange(1, points.shape[1] + 1, device=x.device)
         mine = (region[:, None] == numbers[:, None]).to(x.dtype)
-        even = -normals if traction is None else traction  # as if pushed evenly
+        even = -normals if traction is None else traction  # a uniform push
         contacts: Contacts = self(x, normals, even, indicator, points, mine)
         if traction is not None:
             return contacts
@@ -203,15 +210,15 @@ class ContactPatches(nn.Module):
     def forward(
         self, x: Tensor, normals: Tensor, traction: Tensor, indicator: Tensor, points: Tensor, mine: Tensor
     ) -> Contacts:
-        """Force, normal, area, slip, curvatures of every patch, and whether it reaches the rim.
+        """Compute force, normal, area, slip ratio and curvatures of every patch, and whether it reaches the rim.
 
         Args:
-            x: the surface `[B, V, 3]`.
-            normals: its outward normals `[B, V, 3]`.
+            x: the surface, `[B, V, 3]`.
+            normals: outward normals of the surface, `[B, V, 3]`.
             traction: contact force per rest area, `[B, V, 3]`.
-            indicator: indicator of contact, `[B, V]`.
-            points: the patches' centroids `[B, P, 3]`, NaN where there is none.
-            mine: `[B, P, V]`, 1 where a vertex is the patch's, else 0.
+            indicator: contact indicator, `[B, V]`.
+            points: centroids of the patches, `[B, P, 3]`, NaN if there is none.
+            mine: 1 where a vertex belongs to the patch, else 0, `[B, P, V]`.
         """
         here = torch.isfinite(points[..., 0])
         load = traction * self.membrane.rest_area[:, None]
@@ -246,10 +253,16 @@ class ContactPatches(nn.Module):
         )
 
     def _curvature(self, x: Tensor, normal: Tensor, strong: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-        """Principal curvatures `[B, P, 2]`, the larger first, positive where the surface is hollow seen from outside, and the
-        diameter `[B, P]` of a disc that spreads as the patch; weights `strong` and `share [B, P, V]` add up to 1 each.
+        """Return the principal curvatures `[B, P, 2]` of the patches and the diameters `[B, P]` of discs with the same spread.
 
-        A quadratic height over the plane across `normal [B, P, 3]`, by weighted least squares.
+        The larger curvature comes first; it is positive where the surface is hollow seen from outside. It is the curvature of a
+        quadratic height function over the plane orthogonal to `normal [B, P, 3]`, fitted by least squares.
+
+        Args:
+            x: the surface, `[B, V, 3]`.
+            normal: mean normals of the patches, `[B, P, 3]`.
+            strong: weights of the fit, `[B, P, V]`; they add up to 1.
+            share: weights for centre and spread of a patch, `[B, P, V]`; they add up to 1.
         """
         axes = torch.cat([tangent_frame(normal), normal[:, :, None]], 2)
         local = (axes.flatten(1, 2) @ x.mT).unflatten(1, (-1, 3))

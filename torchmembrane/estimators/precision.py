@@ -1,4 +1,4 @@
-"""The precision that a solve needs."""
+"""Floating-point precision of the solvers."""
 
 from contextlib import AbstractContextManager, nullcontext
 
@@ -11,21 +11,21 @@ PRECISIONS = (torch.float32, torch.float64)
 
 
 def full_precision(device: str) -> AbstractContextManager[object]:
-    """A context without autocast, on devices that have one."""
+    """Return a context that disables autocast on devices that have it."""
     return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
 
 
 def check_precision(dtype: torch.dtype) -> None:
-    """Refuse a module in another precision."""
+    """Refuse a precision other than float32 and float64."""
     if dtype not in PRECISIONS:
         raise MembraneError(
-            f"Reconstructor: in {dtype} the solve loses the answer; expected torch.float32 or torch.float64: call .float() "
-            "(images may be of half precision)"
+            f"Reconstructor: {dtype} is not accurate enough for the solver; expected torch.float32 or torch.float64: call "
+            ".float() (images may have half precision)"
         )
 
 
 def rounded_to_float32(matrix: Tensor) -> Tensor:
-    """A matrix of means as single precision holds it: its last digits mean nothing, and a model's file keeps half.
+    """Round a matrix of weights to float32 values, keeping its dtype: more digits would only double the size of exported files.
 
     Example:
         >>> rounded_to_float32(torch.tensor(0.1, dtype=torch.float64)).item()

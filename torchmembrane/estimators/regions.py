@@ -1,30 +1,32 @@
-"""Regions around the persistent peaks of a field on the grid, strongest first: batched, without a loop over frames or vertices.
+"""Regions around the persistent peaks of a field on the grid, strongest first: batched, without loops over frames or vertices.
 
-Every vertex lies in the basin of the peak that the steepest way up from it ends on. The lowest height on the best path between
-two peaks, the pass, is the least of those between neighbouring basins on the way. A lower peak stands for itself if it is
-higher than the pass to a higher one by `PERSISTENCE` of the highest (Edelsbrunner, Letscher and Zomorodian 2002).
+Every vertex belongs to the basin of the peak at which the steepest ascent from it ends. The pass between two peaks is the
+lowest point of the best path between them, which is the lowest of the passes between adjacent basins along the path. A peak is
+persistent if it is higher than the passes to all higher peaks by `PERSISTENCE` of the highest peak (Edelsbrunner, Letscher and
+Zomorodian 2002).
 """
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-SHARE = 0.5  # of a region's peak: what lies above it, around the peak, is the region
-CANDIDATES = 32  # peaks that are looked at, the highest
-PERSISTENCE = 0.15  # of the highest peak, by which a peak stands above the pass to a higher one, or it is no contact
+SHARE = 0.5  # height above which a vertex belongs to a region, relative to the region's peak
+CANDIDATES = 32  # number of highest peaks that are considered
+PERSISTENCE = 0.15  # smallest height of a peak above the passes to higher ones, relative to the highest peak
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 
 
 def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
-    """Numbered regions: what is joined with a persistent peak above `SHARE` of it, on its side of the passes to the others.
+    """Return numbered regions: the vertices connected to a persistent peak above `SHARE` of it, up to the passes to other
+    peaks.
 
     Args:
-        height: `[B, m, n]`.
-        count: how many regions at most.
-        least: the smallest peak, in the unit of the height.
+        height: field on the grid, `[B, m, n]`.
+        count: largest number of regions.
+        least: smallest height of a peak.
 
     Returns:
-        `[B, m, n]` int64, 0 none, else the number of the region, the highest peak's first.
+        `[B, m, n]` int64: 0 for no region, else its number, with 1 for that of the highest peak.
 
     Example:
         >>> persistent_regions(torch.tensor([[[0.0, 4, 10, 9, 4, 8, 7, 7.2, 0]]]), 4, 0.5).tolist()
@@ -46,16 +48,16 @@ def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
 
 
 def persistent_peaks(height: Tensor, count: int, least: float, apart: float) -> tuple[Tensor, Tensor]:
-    """Peaks, each judged by itself: at least `least` of the highest, and by `apart` of itself above the passes to higher ones.
+    """Return the peaks that exceed a share of the highest peak, and exceed the passes to higher ones by a share of themselves.
 
     Args:
-        height: `[B, m, n]`.
-        count: how many at most.
-        least: smallest peak, over the highest.
-        apart: how much of itself a peak stands above the pass to a higher one.
+        height: field on the grid, `[B, m, n]`.
+        count: largest number of peaks.
+        least: smallest height of a peak relative to the highest.
+        apart: smallest height of a peak above the pass to a higher one, relative to its own height.
 
     Returns:
-        Heights `[B, count]`, highest first, `-inf` where there are no more, and vertices `[B, count]`, row by row.
+        Heights `[B, count]`, highest first, `-inf` if there are fewer, and indices of the vertices, `[B, count]`.
 
     Example:
         >>> heights, vertices = persistent_peaks(torch.tensor([[[0.0, 10, 3, 4, 3.9, 1, 2, 0]]]), 3, 0.1, 0.3)
@@ -69,8 +71,12 @@ def persistent_peaks(height: Tensor, count: int, least: float, apart: float) -> 
 
 
 def _peaks(height: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of the highest peaks where it is `high [B, m n]`: heights and vertices `[B, K]`, highest first, heights of `-inf` where
-    there are no more; whose basin every vertex is in, `[B, m n]`; the passes between them, `[B, K, K]`."""
+    """Return the highest `K` peaks among the vertices where `high [B, m n]` is true.
+
+    Returns:
+        Heights and vertices of the peaks, `[B, K]` each, highest first, with a height of `-inf` if there are fewer; the number
+        of the peak in whose basin every vertex lies, `[B, m n]`; the passes between the peaks, `[B, K, K]`.
+    """
     vertex, summit = torch.arange(high.shape[1], device=height.device), _summits(height)
     top, place = torch.where((summit == vertex) & high, height.flatten(1), -torch.inf).topk(min(CANDIDATES, len(vertex)))
     numbers = torch.arange(top.shape[1], device=height.device)
@@ -79,7 +85,8 @@ def _peaks(height: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor
 
 
 def _summits(height: Tensor) -> Tensor:
-    """The vertex that the steepest way up from every vertex ends on, `[B, m n]`; of equal heights the first is the higher."""
+    """Return the vertex at which the steepest ascent from every vertex ends, `[B, m n]`; of equal heights the first counts as
+    higher."""
     m, n = height.shape[1:]
     wide = F.pad(height, (1, 1, 1, 1), value=-torch.inf)
     around = torch.stack([wide[:, 1 + i : 1 + i + m, 1 + j : 1 + j + n] for i, j in AROUND], 1).flatten(2)
@@ -87,13 +94,13 @@ def _summits(height: Tensor) -> Tensor:
     steps = (n * beside[:, None] + beside).flatten()
     vertex = torch.arange(m * n, device=height.device)
     up = (vertex + steps[around.max(1).indices]).clamp(0, m * n - 1)
-    for _ in range((m * n).bit_length()):  # each time twice as far
+    for _ in range((m * n).bit_length()):  # every iteration doubles the distance
         up = up.gather(1, up)
     return up
 
 
 def _passes(basin: Tensor, height: Tensor, count: int) -> Tensor:
-    """The lowest height on the best path between peaks, `[B, K, K]`, from the basins `[B, m n]` numbered up to `K = count`."""
+    """Return the passes between peaks, `[B, K, K]`, from the basins `[B, m n]` numbered up to `K = count`."""
     flat = height.flatten(1)[:, None]
     inside = torch.where(basin[:, None] == torch.arange(count, device=basin.device)[:, None], flat, -torch.inf)
     beside = torch.minimum(_dilated(inside.unflatten(-1, height.shape[1:])).flatten(2), flat)
@@ -105,11 +112,18 @@ def _passes(basin: Tensor, height: Tensor, count: int) -> Tensor:
 
 
 def _standing_apart(top: Tensor, between: Tensor, count: int, margin: Tensor) -> tuple[Tensor, Tensor]:
-    """Heights and indices `[B, count]`, highest first, of peaks `top [B, K]` that stand above the passes `between [B, K, K]`
-    to higher ones by `margin [B, K]` or `[B, 1]`; heights of `-inf` where there are no more.
+    """Return heights and indices `[B, count]`, highest first, of the peaks that exceed the passes to all higher peaks by a
+    margin.
 
-    `top` goes down. It makes no difference whether the higher ones stand: where the pass to one is too high that does not, the
-    pass from there to a third is too high, and so is the one to the third.
+    Heights are `-inf` if there are fewer peaks. It does not matter whether the higher peaks are selected themselves: if the
+    pass to a higher peak is too high, and that peak is not selected because its pass to a third one is too high, then the pass
+    to the third one is too high as well.
+
+    Args:
+        top: heights of the peaks in descending order, `[B, K]`.
+        between: passes between the peaks, `[B, K, K]`.
+        count: number of peaks to return.
+        margin: `[B, K]` or `[B, 1]`.
     """
     number = torch.arange(top.shape[1], device=top.device)
     too_high = (between > (top - margin)[..., None]) & (number < number[:, None])
@@ -119,7 +133,7 @@ def _standing_apart(top: Tensor, between: Tensor, count: int, margin: Tensor) ->
 
 
 def _dilated(height: Tensor) -> Tensor:
-    """The highest of every vertex and its eight neighbours, `[..., m, n]`: as a 3 x 3 max-pooling, which looks at nine each."""
+    """Return the maximum over every vertex and its eight neighbours, `[..., m, n]`: a separable 3 x 3 max-pooling."""
     wide = F.pad(height, (1, 1, 1, 1), value=-torch.inf)
     rows = torch.maximum(torch.maximum(wide[..., :-2, :], wide[..., 1:-1, :]), wide[..., 2:, :])
     return torch.maximum(torch.maximum(rows[..., :-2], rows[..., 1:-1]), rows[..., 2:])

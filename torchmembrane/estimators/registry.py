@@ -1,4 +1,4 @@
-"""The estimators by their names: those of the package, those that were registered, and those of installed packages."""
+"""Registry of the estimators by name: those of this package, registered ones, and those of installed packages."""
 
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -13,28 +13,27 @@ from .minimum_energy.estimator import MinimumEnergy
 from .paper.estimator import PaperEstimator
 
 GROUP = "torchmembrane.estimators"
-"""The entry points by which an installed package gives estimators their names."""
+"""Group of the entry points by which installed packages register estimators."""
 ESTIMATORS: dict[str, type[Estimator]] = {
     "force-balance": ForceBalance,
     "minimum-energy": MinimumEnergy,
     "paper": PaperEstimator,
 }
 PROTOCOL = ("Settings", "from_problem", "prepare", "forward", "is_converged")
-"""What a subclass of `Estimator` must define."""
+"""Members that a subclass of `Estimator` must define."""
 
 
 def register_estimator(name: str, kind: type[Estimator]) -> None:
-    """Give an estimator a name, by which `Reconstructor` and the command line's `--estimator` know it in this process.
+    """Register an estimator under a name for `Reconstructor` and the command line's `--estimator`, in this process.
 
-    An installed package registers its estimators by entry points of the group `torchmembrane.estimators` instead, which hold in
-    every process.
+    An installed package registers its estimators for all processes by entry points of the group `torchmembrane.estimators`.
 
     Args:
-        name: letters, digits, hyphens and underscores.
+        name: name of the estimator, of letters, digits, hyphens and underscores.
         kind: a subclass of `Estimator`.
 
     Raises:
-        MembraneError: the name is another class's or has other characters, or the class lacks a part of the protocol.
+        MembraneError: the name belongs to another class or has other characters, or the class lacks a part of the protocol.
 
     Example:
         >>> import torchmembrane as tm
@@ -51,13 +50,13 @@ def register_estimator(name: str, kind: type[Estimator]) -> None:
 
 
 def estimator_kind(given: str | type[Estimator]) -> tuple[str, type[Estimator]]:
-    """The name and the class of an estimator.
+    """Return the name and the class of an estimator.
 
     Args:
         given: a name, `MODULE:CLASS`, or the class. The name of a class that is not registered is `MODULE:CLASS`.
 
     Raises:
-        MembraneError: there is none of that name, the module or the class does not exist, or lacks a part of the protocol.
+        MembraneError: the name is unknown, the module or class does not exist, or the class lacks a part of the protocol.
 
     Example:
         >>> estimator_kind("torchmembrane.estimators.paper.estimator:PaperEstimator")[0]
@@ -72,14 +71,14 @@ def estimator_kind(given: str | type[Estimator]) -> tuple[str, type[Estimator]]:
 
 
 def check_protocol(kind: Any, given: str) -> None:
-    """Refuse what is no class with the protocol of an estimator.
+    """Refuse an object that is not a class with the protocol of an estimator.
 
     Args:
-        kind: anything.
-        given: what to call it in an error.
+        kind: the object to check.
+        given: its name in error messages.
 
     Raises:
-        MembraneError: it is no class, or lacks parts of the protocol, which are named.
+        MembraneError: it is not a class, or lacks parts of the protocol, which the message names.
     """
     if not isinstance(kind, type):
         raise MembraneError(f"{given} is not a class; expected a subclass of torchmembrane.Estimator")
@@ -89,19 +88,19 @@ def check_protocol(kind: Any, given: str) -> None:
     if settings is not None and not getattr(getattr(settings, "__dataclass_params__", None), "frozen", False):
         lacking.append("@dataclass(frozen=True) at Settings")
     if lacking:
-        raise MembraneError(f"{given} lacks {', '.join(lacking)}; see torchmembrane.Estimator for what an estimator defines")
+        raise MembraneError(f"{given} lacks {', '.join(lacking)}; see torchmembrane.Estimator for what a subclass must define")
 
 
 def refuse_unfit(sensor: Sensor, name: str, kind: type[Estimator]) -> None:
-    """Refuse a sensor that an estimator cannot take.
+    """Refuse a sensor that an estimator does not support.
 
     Args:
         sensor: the sensor.
         name: name of the estimator, for messages.
-        kind: its class.
+        kind: class of the estimator.
 
     Raises:
-        MembraneError: several views, or markers that stand off the surface, for an estimator that does not take them.
+        MembraneError: the estimator does not support several views, or markers at a distance from the surface.
     """
     views, markers = max(1, len(sensor.views)), sensor.markers
     expected = "1, as of sensor.in_view(0), or force-balance"
@@ -112,16 +111,16 @@ def refuse_unfit(sensor: Sensor, name: str, kind: type[Estimator]) -> None:
 
 
 def built_estimator(problem: Problem, name: str, kind: type[Estimator], settings: Any = None) -> Estimator:
-    """The estimator of a sensor.
+    """Build the estimator for a sensor.
 
     Args:
-        problem: the sensor's.
-        name: name of the estimator, for messages.
-        kind: its class.
-        settings: settings of that class; None: its defaults.
+        problem: description of the sensor.
+        name: name of the estimator.
+        kind: class of the estimator.
+        settings: settings of that class; None for its defaults.
 
     Raises:
-        MembraneError: settings of another estimator.
+        MembraneError: the settings are those of another estimator.
     """
     if settings is not None and not isinstance(settings, kind.Settings):
         raise MembraneError(
@@ -133,7 +132,7 @@ def built_estimator(problem: Problem, name: str, kind: type[Estimator], settings
 
 
 def _named(name: str) -> type[Estimator]:
-    """The estimator of that name, which an installed package may give."""
+    """Return the estimator with this name, registering it if it comes from an installed package."""
     if name in ESTIMATORS:
         return ESTIMATORS[name]
     points = entry_points(group=GROUP)
@@ -142,14 +141,14 @@ def _named(name: str) -> type[Estimator]:
         raise MembraneError(f"estimator {name!r}: installed packages have {', '.join(sorted(values))}; expected MODULE:CLASS")
     if not values:
         names = list(dict.fromkeys([*ESTIMATORS, *sorted(point.name for point in points)]))
-        meant = did_you_mean(name, names, "`register_estimator` gives a class a name")
+        meant = did_you_mean(name, names, "`register_estimator` adds a class under a name")
         raise MembraneError(f"Reconstructor: estimator = {name!r}; expected one of {', '.join(names)} or MODULE:CLASS; {meant}")
     register_estimator(name, _imported(values.pop()))
     return ESTIMATORS[name]
 
 
 def _imported(path: str) -> Any:
-    """What `MODULE:CLASS` stands for."""
+    """Import `MODULE:CLASS`."""
     name, _, member = path.partition(":")
     try:
         module = import_module(name)
@@ -165,5 +164,5 @@ def _imported(path: str) -> Any:
 
 
 def _defines(kind: type, part: str) -> bool:
-    """Whether a class or one of its bases, `Estimator` and its own left out, defines this part of the protocol."""
+    """Return whether a class or one of its bases, other than `Estimator` and its bases, defines this part of the protocol."""
     return any(part in vars(base) for base in kind.__mro__ if base not in Estimator.__mro__)

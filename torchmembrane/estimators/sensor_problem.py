@@ -1,4 +1,4 @@
-"""What an estimator is built from, of a sensor whose markers are placed."""
+"""The `Problem` of a sensor whose markers have been located on its surface."""
 
 import torch
 
@@ -8,17 +8,17 @@ from ..sensor.factories import CavityFilling
 from ..surface.membrane import Membrane
 from .base import Problem
 
-LEAST_ERROR = 0.02  # px
+LEAST_ERROR = 0.02  # smallest standard deviation of a marker's position, px
 
 
 def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, cavity: CavityFilling) -> Problem:
-    """The problem of a sensor, in double precision.
+    """Return the problem of a sensor, in double precision.
 
     Args:
-        seen: how its markers are seen.
+        seen: the markers as the camera sees them.
         membrane: the rest surface on the solver's grid.
-        elasticity: elasticity of the membrane.
-        cavity: what fills it.
+        elasticity: elastic energy of the membrane.
+        cavity: filling of the cavity.
     """
     views = len(seen.positions) // len(seen.markers.positions)
     return Problem(

@@ -1,1 +1,1 @@
-"""Elastic energies of the membrane, and the cavity it encloses."""
+"""Elastic energies of the membrane, and the cavity that it encloses."""

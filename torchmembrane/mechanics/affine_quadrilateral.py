@@ -1,4 +1,4 @@
-"""The paper's element: one affine map for each quadrilateral (eqs. 11-18)."""
+"""The paper's element: one affine map per quadrilateral (eqs. 11-18)."""
 
 import torch
 from torch import Tensor, nn
@@ -10,15 +10,16 @@ from ..surface.topology import corners, corners_to_vertices
 class AffineQuadrilaterals(nn.Module):
     """The paper's element: one affine map fitted to the four corners (eqs. 15-18), linear in the corner positions.
 
-    The map is fitted in the plane of the quadrilateral (spanned by its diagonals; in space G of eq. 16 is singular), so that
-    `A [3, 2] = sum_k x_k g_k^T` with constant `g_k`, and `E = 1/2 tension sum area tr(A^T A)` (eq. 12 with its 1/2).
+    The map is fitted in the plane that the diagonals of the quadrilateral span, because in space the matrix G of eq. 16 is
+    singular. So `A [3, 2] = sum_k x_k g_k^T` with constant `g_k`, and the energy is `E = 1/2 tension sum area tr(A^T A)` (eq.
+    12 with its 1/2).
 
     Args:
         membrane: the rest surface.
         tension: tension of the rest state, force / length.
 
     Limitations:
-        It is blind to the hourglass mode: use it with the smoother (eq. 28).
+        The hourglass mode has no energy: use the element with the smoother (eq. 28).
     """
 
     map_weights: Tensor
@@ -45,27 +46,35 @@ class AffineQuadrilaterals(nn.Module):
         self.register_buffer("area", area)
 
     def affine_maps(self, x: Tensor) -> Tensor:
-        """Linear parts `A [..., m-1, n-1, 3, 2]` of the maps from each quadrilateral's rest plane."""
+        """Return the linear parts `A [..., m-1, n-1, 3, 2]` of the maps from the quadrilaterals' rest planes."""
         return corners(x, self.grid).mT @ self.map_weights
 
     def energy(self, x: Tensor) -> Tensor:
-        """`1/2 tension sum area tr(A^T A)`, `[..., V, 3]` to `[...]`; less the rest's, as `ElasticEnergy`'s harmonic energy."""
+        """Return the energy `1/2 tension sum area tr(A^T A)` of vertices `x [..., V, 3]`, minus its value at rest, `[...]`.
+
+        `ElasticEnergy` defines its harmonic energy in the same way.
+        """
         maps = self.affine_maps(x)
         return self.tension / 2 * (self.area * ((maps**2).sum((-1, -2)) - 2)).sum((-1, -2))
 
     def gradient(self, x: Tensor, weight: Tensor | None = None) -> Tensor:
-        """`dE/dx`, `[..., V, 3]`; `weight [..., m-1, n-1]`: of each quadrilateral's share, default 1."""
+        """Return the gradient `dE/dx`, `[..., V, 3]`.
+
+        Args:
+            x: vertices `[..., V, 3]`.
+            weight: weight of each quadrilateral's energy, `[..., m-1, n-1]`; default 1.
+        """
         scale = self.tension * self.area if weight is None else self.tension * self.area * weight
         maps = self.affine_maps(x) * scale[..., None, None]
         return corners_to_vertices(self.map_weights @ maps.mT, self.grid)
 
     def local_maps(self, directions: Tensor) -> Tensor:
-        """What each corner's range adds to the map of its quadrilateral (eqs. 15-17): `A = sum_k t_k A_k`.
+        """Return the derivatives of each quadrilateral's map in the ranges of its corners (eqs. 15-17): `A = sum_k t_k A_k`.
 
-        The fit `A = F^T G^-1` is linear in the points `t_k d_k` that it maps to; `G^-1` is in the constant weights.
+        The fit `A = F^T G^-1` is linear in the corner positions `t_k d_k`; the constant weights contain `G^-1`.
 
         Args:
-            directions: `[..., V, 3]`, the rays' unit directions.
+            directions: unit directions of the rays, `[..., V, 3]`.
 
         Returns:
             `A_k [..., m-1, n-1, 3, 2, 4]`.
@@ -73,26 +82,32 @@ class AffineQuadrilaterals(nn.Module):
         return corners(directions, self.grid).mT[..., :, None, :] * self.map_weights.mT[..., None, :, :]
 
     def q_blocks(self, directions: Tensor, weight: Tensor | None = None) -> Tensor:
-        """The paper's Q (eq. 18) by quadrilaterals, `[..., m-1, n-1, 6, 4]`: the weighted entries of the map, linear in the
-        ranges of the four corners. Summed over quadrilaterals `Q^T Q = K`.
+        """Return the paper's matrix Q (eq. 18) of every quadrilateral, `[..., m-1, n-1, 6, 4]`.
+
+        It maps the ranges of the four corners to the weighted entries of the affine map. The sum of `Q^T Q` over the
+        quadrilaterals is `K`.
 
         Args:
-            directions: `[..., V, 3]`, the rays' unit directions.
-            weight: `[..., m-1, n-1]`, of each quadrilateral's energy, default 1.
+            directions: unit directions of the rays, `[..., V, 3]`.
+            weight: weight of each quadrilateral's energy, `[..., m-1, n-1]`; default 1.
         """
         scale = self.tension * self.area if weight is None else self.tension * self.area * weight
         return self.local_maps(directions).flatten(-3, -2) * scale.sqrt()[..., None, None]
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
-        """Corner matrices `[..., m-1, n-1, 4, 4]` of `K = L o (R R^T)`, exactly quadratic: `x` is not looked at."""
+        """Return the corner matrices `[..., m-1, n-1, 4, 4]` of `K = L o (R R^T)`.
+
+        The energy is quadratic, so they do not depend on `x`.
+        """
         d = corners(directions, self.grid)
         L = (self.tension * self.area)[..., None, None] * (self.map_weights @ self.map_weights.mT)
         return L * (d @ d.mT)
 
     def q_matrix(self, directions: Tensor) -> Tensor:
-        """The paper's `Q` (eq. 18), `[..., 6 (m-1)(n-1), V]`: rows are the weighted entries of all maps, linear in `t`.
+        """Return the paper's matrix `Q` (eq. 18) as a dense matrix `[..., 6 (m-1)(n-1), V]`.
 
-        `||Q t||^2 = t^T K t`. Dense: for study and tests, the estimator works with its square.
+        It maps the ranges `t` to the weighted entries of all affine maps, so `||Q t||^2 = t^T K t`. It is meant for studies and
+        tests; the estimator uses `K`.
         """
         one = torch.eye(self.grid[0] * self.grid[1], dtype=directions.dtype, device=directions.device)
         return (self.q_blocks(directions) @ corners(one, self.grid)).flatten(-4, -2)

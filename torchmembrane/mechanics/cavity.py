@@ -1,4 +1,5 @@
-"""The law of the enclosed fluid: constant volume (liquid), constant pressure x volume (gas), or constant pressure (open)."""
+"""The law of the enclosed fluid: constant volume (liquid), constant pressure x volume (gas), or constant pressure (open
+cavity)."""
 
 from typing import Protocol, TypeVar
 
@@ -17,17 +18,17 @@ Scalar = TypeVar("Scalar", float, Tensor)
 def gas_law_step(
     rise: Scalar, pressure: Scalar, rest_pressure: Scalar, absolute: Scalar, volume: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """The law of a gas, `absolute pressure x volume = constant`, linearised in the pressure.
+    """Linearise the law of a gas, `absolute pressure x volume = constant`, for one step of a solver.
 
-    The law is `p = p0 + P (V_gas / (V_gas + rise) - 1)`. A step of a solve that ends on it has
+    The law is `p = p0 + P (V_gas / (V_gas + rise) - 1)`. A step leads to a state that satisfies the linearised law if
     `volume step + C (pressure step) = c`.
 
     Args:
-        rise: rise of the cavity's volume above that at rest, `[...]`.
-        pressure: pressure difference across the membrane, `[...]`.
-        rest_pressure: p0, pressure difference at rest.
-        absolute: P, the gas's absolute pressure at rest, force / length^2.
-        volume: V_gas, the gas's volume at rest, length^3.
+        rise: increase of the cavity's volume from rest, `[...]`, length^3.
+        pressure: pressure difference across the membrane, `[...]`, force / length^2.
+        rest_pressure: p0, pressure difference at rest, force / length^2.
+        absolute: P, absolute pressure of the gas at rest, force / length^2.
+        volume: V_gas, volume of the gas at rest, length^3.
 
     Returns:
         Target `c` and compliance `C`, `[...]` each.
@@ -42,16 +43,16 @@ def gas_law_step(
 
 
 class CavityLaw(nn.Module):
-    """The cavity's law, linearised for one step of a solve.
+    """The law of the cavity's filling, linearised for one step of a solver.
 
     Args:
         membrane: the rest surface.
-        rest_pressure: the pressure difference at rest, `[]`.
-        filling: "liquid" (volume kept), "gas" (pressure x volume kept) or "open" (pressure stays at rest).
-        gas: absolute pressure at rest (force / length^2) and volume (length^3) of a gas.
+        rest_pressure: pressure difference at rest, `[]`.
+        filling: "liquid" (constant volume), "gas" (constant pressure x volume) or "open" (pressure stays as at rest).
+        gas: absolute pressure (force / length^2) and volume (length^3) of a gas at rest.
 
     Raises:
-        MembraneError: an unknown filling, or a gas without its numbers.
+        MembraneError: the filling is unknown, or pressure and volume of a gas are missing.
     """
 
     rest_pressure: Tensor
@@ -76,9 +77,11 @@ class CavityLaw(nn.Module):
         self.register_buffer("gas", torch.tensor(gas if gas else (1.0, 1.0), dtype=torch.float64))
 
     def condition(self, rise: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Target `c [...]` and compliance `C` (a liquid's `[]`) of a step, `v.y + C (pressure step) = c`.
+        """Return the target `c [...]` and the compliance `C` (`[]` for a liquid) of a step, `v.y + C (pressure step) = c`.
 
-        Arguments: the volume's `rise [...]` above its rest value, and the pressure `[...]`.
+        Args:
+            rise: increase of the volume from rest, `[...]`.
+            pressure: pressure difference across the membrane, `[...]`.
         """
         if self.filling == "liquid":
             return -rise, rise.new_zeros(())
@@ -86,7 +89,7 @@ class CavityLaw(nn.Module):
         return gas_law_step(rise, pressure, self.rest_pressure, absolute, volume)
 
     def target_volume(self, volume: Tensor, pressure: Tensor) -> Tensor:
-        """The volume that the law requires at this pressure, `[...]` (an open cavity: any volume)."""
+        """Return the volume that the law requires at this pressure, `[...]`; for an open cavity the given volume."""
         if self.filling == "liquid":
             return self.rest_volume.expand(volume.shape)
         if self.filling == "open":
@@ -95,23 +98,26 @@ class CavityLaw(nn.Module):
         return self.rest_volume + gas * (absolute / (absolute + pressure - self.rest_pressure) - 1)
 
     def volume_error(self, volume: Tensor, pressure: Tensor) -> Tensor:
-        """The deviation of the volume from the one that the law requires, relative to the rest volume, `[...]`."""
+        """Return the deviation of the volume from the one that the law requires, relative to the rest volume, `[...]`."""
         return (volume - self.target_volume(volume, pressure)) / self.rest_volume
 
 
 class HasGradient(Protocol):
-    """An energy: of triangles, or the paper's element."""
+    """An energy with a gradient: `ElasticEnergy` or the paper's element."""
 
     def gradient(self, x: Tensor) -> Tensor:
-        """Its derivative in the vertices, `[..., V, 3]`."""
+        """Return the gradient with respect to the vertices, `[..., V, 3]`."""
         ...
 
 
 def rest_balance(membrane: Membrane, energy: HasGradient) -> tuple[Tensor, Tensor]:
-    """Rest pressure `p0 []` and rest load `h = grad U(X) - p0 grad V(X)` of the free vertices, `[V, 3]`, zero on the rim.
+    """Return the rest pressure `p0 []` and the rest load `h = grad U(X) - p0 grad V(X)`, `[V, 3]`, zero at fixed vertices.
 
-    `p0` weights both with the normals, so that spurious tangential parts have zero weight; `energy`: an `ElasticEnergy` or the
-    paper's element.
+    `p0` balances the normal components of both gradients; spurious tangential components do not affect it.
+
+    Args:
+        membrane: the rest surface.
+        energy: an `ElasticEnergy` or the paper's element.
     """
     force, of_fluid = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
     normal, free = membrane.rest_normals, membrane.free_vertices

@@ -1,8 +1,8 @@
 """Elastic energy of the membrane on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin.
 
 With the rest metric `G` and the deformed metric `g` of a triangle's edges, `I = tr(G^-1 g)` and `D = det g / det G` are the
-invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Everything is in units of shear modulus x thickness (of the
-prestretched rest state) unless these are given; the prestretch `l` is that of the rest state.
+invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Unless a modulus is given, results are in units of shear
+modulus x thickness in the rest state. `l` is the prestretch of the rest state.
 """
 
 from typing import NamedTuple
@@ -41,12 +41,12 @@ class Derivatives(NamedTuple):
     ID: Tensor
     DD: Tensor
     convex_D: Tensor
-    """The part of `D` that comes from terms convex in the metric; the rest is left out of the stiffness (Gauss-Newton)."""
+    """The part of `D` from terms that are convex in the metric; a Gauss-Newton stiffness omits the other terms."""
 
 
 class Strain(NamedTuple):
-    """Of `T` triangles: the two edges from the first vertex `[..., 3, 2, T]`, the adjugate of their metric `[..., 3, T]`
-    (11, 12, 22), the invariants `I` and `D` `[..., 1, T]`."""
+    """The strain of `T` triangles: their two edges from the first vertex `[..., 3, 2, T]`, the entries 11, 12, 22 of the
+    adjugate of their metric `[..., 3, T]`, and the invariants `I` and `D` `[..., 1, T]`."""
 
     edges: Tensor
     adjugate: Tensor
@@ -55,7 +55,7 @@ class Strain(NamedTuple):
 
 
 class ElasticEnergy(nn.Module):
-    """The membrane's elastic energy `U(x)`, its gradient, and its stiffness along given directions.
+    """The membrane's elastic energy `U(x)`, with its gradient, and its stiffness along given directions.
 
     harmonic       `W = mu/2 l^2 (I - 2)` (eq. 11 with the 1/2 and the area element that the printed formula lacks)
     neo_hookean    `W = mu/2 (l^2 I + 1 / (l^4 D) - 3)`
@@ -64,12 +64,12 @@ class ElasticEnergy(nn.Module):
     Args:
         membrane: the rest surface.
         model: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: l, of the rest state.
-        modulus: mu, shear modulus x thickness at rest, force / length.
-        c2_ratio: C2 / C1, Mooney-Rivlin only.
+        prestretch: prestretch l of the rest state.
+        modulus: mu, the shear modulus times the thickness at rest, force / length.
+        c2_ratio: C2 / C1, for Mooney-Rivlin only.
 
     Raises:
-        MembraneError: an unknown model.
+        MembraneError: the model is unknown.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -135,7 +135,8 @@ class ElasticEnergy(nn.Module):
         self._register_cells(membrane)
 
     def _register_one_ring(self, membrane: Membrane) -> None:
-        """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across), constants."""
+        """Register constants of the six triangles around every vertex, `6 V` in all; each has two sides at the vertex and one
+        opposite to it."""
         own, ring = stencil_kernels()[:1], stencil_kernels()[1:]
         following = ring.roll(-1, 0)
         self.register_buffer("sides", torch.cat([ring - own, following - own, following - ring]))
@@ -149,7 +150,7 @@ class ElasticEnergy(nn.Module):
         g11, g12, g22 = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)
         det = torch.where(missing, 1.0, g11 * g22 - g12**2)
         twice_area = torch.where(missing, 0.0, det.sqrt())
-        self.register_buffer("first", torch.stack([g22 - g12, g11 - g12, g12]) / det)  # I is their sum over the sides' squares
+        self.register_buffer("first", torch.stack([g22 - g12, g11 - g12, g12]) / det)  # weights of the squared sides in I
         self.register_buffer("missing", missing.double())
         self.register_buffer("half_over_det", torch.where(missing, 0.0, 0.5 / det))
         self.register_buffer("force_of_I", -twice_area * self.first[:2])
@@ -168,14 +169,14 @@ class ElasticEnergy(nn.Module):
         self.register_buffer("cell_second", 1 / det.sqrt())
 
     def for_membrane(self, membrane: Membrane) -> "ElasticEnergy":
-        """The same material on another membrane or grid."""
+        """Return the energy of the same material on another membrane or grid."""
         modulus = 2 * float(self.c1 + self.c2)
         return ElasticEnergy(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
 
     on = for_membrane  # its name before 0.2.0
 
     def strain(self, x: Tensor) -> Strain:
-        """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
+        """Return the strain of all `T = 2 (m-1) (n-1)` triangles of vertices `x [..., V, 3]`."""
         return self._strain(edge_vectors(x, self.grid))
 
     def _strain(self, edges: Tensor) -> Strain:
@@ -184,10 +185,11 @@ class ElasticEnergy(nn.Module):
         return Strain(edges, adjugate(g), first, determinant(g) / self.det)
 
     def principal_stretches(self, x: Tensor) -> Tensor:
-        """The stretches of every triangle along its two principal directions, relative to the rest state.
+        """Return the stretches of every triangle along its two principal directions, relative to the rest state.
 
-        The singular values of the deformation gradient F (eqs. 43, 44): with the invariants `I` and `D` of `C = F^T F` their
-        squares are `(I + sqrt(I^2 - 4 D)) / 2` and `D` over that. Relative to the unstretched membrane: times the prestretch.
+        They are the singular values of the deformation gradient F (eqs. 43, 44). With the invariants `I` and `D` of
+        `C = F^T F`, their squares are `s = (I + sqrt(I^2 - 4 D)) / 2` and `D / s`. Multiply them by the prestretch for the
+        stretches relative to the unstretched membrane.
 
         Args:
             x: vertices `[..., V, 3]`.
@@ -196,7 +198,7 @@ class ElasticEnergy(nn.Module):
             `[..., T, 2]`, largest first, triangles in the order of `Membrane.triangles`.
 
         Limitations:
-            Where both are equal they are not differentiable, and only accurate to the square root of the rounding error.
+            Equal stretches are not differentiable, and only accurate to the square root of the rounding error.
 
         Example:
             >>> from torchmembrane.surface.shapes import heightfield
@@ -207,18 +209,18 @@ class ElasticEnergy(nn.Module):
         """
         _, _, I, D = self.strain(x)  # noqa: E741
         larger = (I + (I * I - 4 * D).clamp_min(0).sqrt()) / 2
-        squared = torch.cat([larger, D / larger], -2).unflatten(-1, (2, -1))  # first and second halves of all quadrilaterals
+        squared = torch.cat([larger, D / larger], -2).unflatten(-1, (2, -1))  # all first triangles, then all second ones
         return squared.transpose(-3, -1).flatten(-3, -2).sqrt()
 
     def density(self, I: Tensor, D: Tensor) -> Tensor:  # noqa: E741
-        """Energy per rest area `W(I, D)`."""
+        """Return the energy per rest area `W(I, D)`."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
         if self.model == "harmonic":
             return c1 * l2 * (I - 2)
         return c1 * (l2 * I + 1 / (l2**2 * D) - 3) + c2 * (l2**2 * D + I / (l2 * D) - 3)
 
     def first_derivatives(self, I: Tensor, D: Tensor) -> tuple[Tensor, Tensor]:  # noqa: E741
-        """First derivatives of `density`, `dW/dI` and `dW/dD`; constant ones are scalars."""
+        """Return the first derivatives of `density`, `dW/dI` and `dW/dD`; constant ones are scalars."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
         if self.model == "harmonic":
             return c1 * l2, torch.zeros_like(l2)
@@ -229,7 +231,7 @@ class ElasticEnergy(nn.Module):
         return c1 * l2 + c2 / l2 * inverse, w_D - c2 / l2 * I * inverse * inverse + c2 * l2**2
 
     def derivatives(self, I: Tensor, D: Tensor) -> Derivatives:  # noqa: E741
-        """First and second derivatives of `density`; constant ones are scalars."""
+        """Return the first and second derivatives of `density`; constant ones are scalars."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
         zero, (w_I, w_D) = torch.zeros_like(l2), self.first_derivatives(I, D)
         if self.model == "harmonic":
@@ -239,21 +241,21 @@ class ElasticEnergy(nn.Module):
         return Derivatives(w_I, w_D, -c2 / (l2 * D**2), 2 * c1 / (l2**2 * D**3) + 2 * c2 * I / (l2 * D**3), w_D - c2 * l2**2)
 
     def energy(self, x: Tensor) -> Tensor:
-        """`U(x)`, `[..., V, 3]` to `[...]`."""
+        """Return the energy `U [...]` of vertices `x [..., V, 3]`."""
         _, _, I, D = self.strain(x)  # noqa: E741
         return (self.area * self.density(I, D)).sum((-1, -2))
 
     def gradient(self, x: Tensor) -> Tensor:
-        """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign."""
+        """Return the gradient `dU/dx`, `[..., V, 3]`: the membrane's nodal forces with opposite sign."""
         if torch.compiler.is_exporting():
             return self.gradient_by_rings(x)
         return self._gradient(cell_edges(x, self.grid))
 
     def gradient_of_displaced(self, u: Tensor) -> Tensor:
-        """`gradient` of the surface that is displaced from rest by `u [..., V, 3]`.
+        """Return `gradient` for a surface that is displaced from rest by `u [..., V, 3]`.
 
-        The edges are computed as those at rest plus the differences of `u`. Positions in float32 would round the strain of a
-        short edge far from the origin by more than the strain from a slack sheet's tension.
+        The edges are computed as the rest edges plus the differences of `u`. If they were computed from positions in float32,
+        rounding would change the strain of a short edge far from the origin by more than a slack sheet's tension does.
         """
         if torch.compiler.is_exporting():
             return self._gradient_by_rings(self.rest_sides + apply_stencil(u, self.sides, self.grid))
@@ -271,9 +273,9 @@ class ElasticEnergy(nn.Module):
         return forces_of_stress(edges, stress + self.cell_first * w_I.expand(D.shape).unsqueeze(-4))
 
     def gradient_by_rings(self, x: Tensor) -> Tensor:
-        """`gradient`, at every vertex from the six triangles around it: by convolution, fast in exported models.
+        """Return `gradient`, computed from the six triangles around each vertex by convolutions: fast in exported models.
 
-        `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
+        `I` is linear and `D` quadratic (Heron) in the squared lengths `l` of a triangle's three sides.
         """
         return self._gradient_by_rings(apply_stencil(x, self.sides, self.grid))
 
@@ -287,21 +289,33 @@ class ElasticEnergy(nn.Module):
         return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * of_sides.reshape(*batch, 1, 12, V)).sum(-2).mT
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
-        """Positive semi-definite stiffness for displacements along one direction at each vertex.
+        """Return the positive semi-definite stiffness for displacements along one direction at each vertex.
 
-        Arguments: `x [..., V, 3]`, `directions [..., V, 3]`. Returns the corner matrices `[..., m-1, n-1, 4, 4]`, whose sum
-        over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the membrane is in tension (for
-        Mooney-Rivlin without the term of `D` that is not convex), and for the harmonic energy `L_kl d_k . d_l` (eq. 64).
+        Its sum over quadrilaterals is `K_kl = d_k . H_kl d_l` with the Hessian `H` of `U`. It is exact where the membrane is in
+        tension, except that Mooney-Rivlin's non-convex term in `D` is omitted. For the harmonic energy it is `L_kl d_k . d_l`
+        (eq. 64).
+
+        Args:
+            x: vertices `[..., V, 3]`.
+            directions: direction at each vertex, `[..., V, 3]`.
+
+        Returns:
+            The corner matrices of all quadrilaterals, `[..., m-1, n-1, 4, 4]`.
         """
         H = self.hessian_blocks(x, positive=True).unflatten(-1, (3, 3)).unflatten(-3, (3, 3))
         d = triangles_of(corners(directions, self.grid))
         return self._quadrilaterals(torch.einsum("...kilj,...ki,...lj->...kl", H, d, d))
 
     def hessian_blocks(self, x: Tensor, positive: bool = False) -> Tensor:
-        """Second derivatives of every triangle's energy in its nine vertex coordinates, `[..., m-1, n-1, 2, 9, 9]`.
+        """Return the second derivatives of every triangle's energy with respect to its nine vertex coordinates.
 
-        Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
-        that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
+        Args:
+            x: vertices `[..., V, 3]`.
+            positive: whether to omit compressive stress and Mooney-Rivlin's non-convex term in `D`, so that every block is
+                positive semi-definite. Otherwise the derivatives are exact.
+
+        Returns:
+            `[..., m-1, n-1, 2, 9, 9]`, vertices in the order of `TRIANGLE_CORNERS`.
         """
         pairs = self._pairs(self.strain(x), positive)[..., :9, :, :].unflatten(-1, (2, *_cells(self.grid)))
         ab, ac, bc = pairs.unflatten(-5, (3, 3)).movedim((-3, -4, -6, -5), (-4, -3, -2, -1)).unbind(-3)
@@ -309,13 +323,16 @@ class ElasticEnergy(nn.Module):
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
     def one_ring(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Inner vertices' forces and tangent stiffness, by their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
+        """Return the gradient and the tangent stiffness at the inner vertices, as coefficients of their six neighbours.
 
-        The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
-        in the vertex itself minus the sum of the six.
+        The gradient at vertex `k` is `sum_i s_i (x_i - x_k)` over the six neighbours `i`. Its derivative with respect to
+        neighbour `i` is `H_i`, and with respect to the vertex itself minus the sum of all `H_i`.
 
         Args:
-            u: displacement from rest, `[..., V, 3]`, as for `gradient_of_displaced`.
+            u: displacement from rest, `[..., V, 3]`.
+
+        Returns:
+            `s [..., 6, N]` and `H [..., 3, 3, 6, N]`.
         """
         (m, n), pairs = self.grid, self._pairs(self._strain(self.rest_edges + edge_vectors(u, self.grid)))
         planes = pairs.reshape(-1, 6, *_cells(self.grid))
@@ -325,11 +342,13 @@ class ElasticEnergy(nn.Module):
         return both[..., 9, :, :], both[..., :9, :, :].unflatten(-3, (3, 3))
 
     def _pairs(self, strain: Strain, positive: bool = False) -> Tensor:
-        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2): the nine entries of `B + S 1`, and `S`, `[...,
-        10, 3, T]`.
+        """Return the second derivatives of the energy in the vertex pairs (0, 1), (0, 2), (1, 2) of all triangles.
 
-        Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`: `S` is the stress, force on edge a is
-        `sum_b S_ab e_b`, and `T` comes from the second derivatives `Q` in the metric.
+        The second derivatives in the edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`. Here `S` is the stress
+        (the force on edge `a` is `sum_b S_ab e_b`), and `T` follows from the second derivatives `Q` in the metric.
+
+        Returns:
+            The nine entries of a pair's block, then its coefficient of the unit matrix, `[..., 10, 3, T]`.
         """
         e, adjugate, I, D = strain  # noqa: E741
         w, q = self.derivatives(I, D), self.twice_12 / self.det * adjugate
@@ -352,7 +371,7 @@ class ElasticEnergy(nn.Module):
 
     @property
     def tension(self) -> Tensor:
-        """Rest tension (force / length): the isotropic stress resultant at `x = X`."""
+        """Tension of the rest state, force / length: the isotropic stress resultant at `x = X`."""
         two, one = self.prestretch.new_full((), 2.0), self.prestretch.new_full((), 1.0)
         w = self.derivatives(two, one)
         return 2 * (w.I + w.D)

@@ -1,5 +1,7 @@
-"""Edges of triangles, their metrics, and the constants of derivatives with respect to the metric. Symmetric 2 x 2 matrices are
-given as (11, 12, 22)."""
+"""Edges of triangles, their metrics, and constants for derivatives with respect to the metric.
+
+Symmetric 2 x 2 matrices are given by their entries 11, 12, 22.
+"""
 
 import numpy as np
 import torch
@@ -11,35 +13,36 @@ from ..solve.symmetric_2x2 import symmetric_determinant
 
 
 def edge_vectors(x: Tensor, grid: tuple[int, int]) -> Tensor:
-    """The two edges from the first vertex of all triangles, `[..., V, 3]` to `[..., 3, 2, T]`."""
-    g = x.transpose(-2, -1).contiguous().unflatten(-1, grid)  # or the components stay last in memory, at triple the time
+    """Return the two edges from the first vertex of all triangles, `[..., 3, 2, T]`, of vertices `x [..., V, 3]`."""
+    g = x.transpose(-2, -1).contiguous().unflatten(-1, grid)  # with components last in memory it would take three times as long
     a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
     ac = c - a
     return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -4).flatten(-3)
 
 
 def metric(edges: Tensor) -> Tensor:
-    """Entries (11, 12, 22) of the metric of two edges `[..., 3, 2, T]`, `[..., 3, T]`."""
+    """Return the metrics `[..., 3, T]` of pairs of edges `[..., 3, 2, T]`."""
     e1, e2 = edges.split(1, -2)
     return (torch.cat([e1, e1, e2], -2) * torch.cat([e1, e2, e2], -2)).sum(-3)
 
 
 def adjugate(g: Tensor) -> Tensor:
-    """Entries (11, 12, 22) of the adjugates of symmetric matrices given so, `[..., 3, T]`."""
+    """Return the adjugates of symmetric matrices, `[..., 3, T]` each."""
     g11, g12, g22 = g.split(1, -2)
     return torch.cat([g22, -g12, g11], -2)
 
 
 def determinant(g: Tensor) -> Tensor:
-    """Determinants `[..., 1, T]` of symmetric matrices `[..., 3, T]`."""
+    """Return the determinants `[..., 1, T]` of symmetric matrices `[..., 3, T]`."""
     return symmetric_determinant(*g.split(1, -2))
 
 
 def metric_constants() -> dict[str, Tensor]:
-    """The constants of second derivatives with respect to the metric's entries 11, 12, 22.
+    """Return constants for second derivatives with respect to the metric's entries 11, 12, 22.
 
-    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of
-    `ElasticEnergy._pairs`; `stress_to_pairs [3, 3]`, likewise for the stress.
+    `twice_12 [3]` counts the off-diagonal entry twice. `bend [9]` are the second derivatives of the determinant.
+    `metric_to_pairs [12, 9]` maps second derivatives in the metric to `T_cd` of `ElasticEnergy._pairs`, and `stress_to_pairs
+    [3, 3]` maps the stress to `S`, both for the three vertex pairs of a triangle.
     """
     dg = np.zeros((2, 3, 2))  # d g / d e_a = sum_c dg[a, g, c] e_c
     dg[0, 0, 0] = dg[1, 2, 1] = 2.0
@@ -55,7 +58,7 @@ def metric_constants() -> dict[str, Tensor]:
 
 
 def tensile_part(stress: Tensor) -> Tensor:
-    """The positive semi-definite part of symmetric 2 x 2 matrices given as (11, 12, 22), `[..., 3, T]`."""
+    """Return the positive semi-definite part of symmetric 2 x 2 matrices, `[..., 3, T]`: negative eigenvalues become zero."""
     s11, s12, s22 = stress.split(1, -2)
     mean, half = (s11 + s22) / 2, (s11 - s22) / 2
     radius = (half**2 + s12**2).clamp_min(torch.finfo(stress.dtype).tiny).sqrt()
@@ -65,11 +68,13 @@ def tensile_part(stress: Tensor) -> Tensor:
 
 
 def one_ring_constants() -> dict[str, Tensor]:
-    """The constants of sums over the triangles around a vertex.
+    """Return constants for sums over the triangles around a vertex.
 
-    `around [12, 6, 2, 2]`: of the three pairs in the first and in the second triangles of the quadrilaterals about a vertex
-    those that join it with `ONE_RING`, then those that do so the other way round, whose blocks count `transposed [10]`; `one
-    [9, 1, 1]`, the entries of the unit matrix."""
+    `around [12, 6, 2, 2]` are convolution kernels. Their input planes are the three vertex pairs of the first and second
+    triangles of all quadrilaterals. They sum the pairs that lead from a vertex to each neighbour in `ONE_RING`, then those that
+    lead from the neighbour to the vertex; the index `transposed [10]` transposes the blocks of the latter. `one [9, 1, 1]` has
+    the entries of the unit matrix.
+    """
     joins = ((0, 0, 0, 1, 1), (1, 1, 0, 1, 1), (1, 0, 1, 1, 1), (2, 2, 0, 0, 1), (2, 1, 1, 1, 1), (3, 2, 1, 0, 0))
     back = ((0, 2, 1, 1, 0), (3, 0, 0, 0, 1), (4, 1, 0, 0, 0), (4, 0, 1, 0, 0), (5, 2, 0, 0, 0), (5, 1, 1, 1, 0))
     around = torch.zeros(2, len(ONE_RING), 3, 2, 2, 2, dtype=torch.float64)
@@ -82,19 +87,19 @@ def one_ring_constants() -> dict[str, Tensor]:
 
 
 def products(a: Tensor, b: Tensor) -> Tensor:
-    """All products of two entries of `[..., 3, T]`: `[..., 9, T]`."""
+    """Return all products `[..., 9, T]` of an entry of `a [..., 3, T]` and an entry of `b [..., 3, T]`."""
     return (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)
 
 
 def cell_edges(x: Tensor, grid: tuple[int, int]) -> Tensor:
-    """The edges of every quadrilateral `a b c d` from `a` to `b`, `c` and `d`: of its triangles `a b c` and `a c d`.
+    """Return the edges of every quadrilateral `a b c d` from `a` to `b`, `c` and `d`, in its triangles `a b c` and `a c d`.
 
     Args:
         x: vertices `[..., V, 3]`.
         grid: `m, n`.
 
     Returns:
-        `[..., 3, 3, m-1, n-1]`, edges and then components.
+        Edges and their components, `[..., 3, 3, m-1, n-1]`.
     """
     g = x.mT.unflatten(-1, grid)
     ends = torch.stack([g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]], -4)
@@ -102,16 +107,20 @@ def cell_edges(x: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def cell_metric(edges: Tensor) -> Tensor:
-    """The metric of the two edges of each triangle, its entries 11, 12, 22: `[..., 3, 2, m-1, n-1]`."""
+    """Return the metrics of both triangles of every quadrilateral, `[..., 3, 2, m-1, n-1]`, from the result of `cell_edges`."""
     square = (edges * edges).sum(-3)
     mixed = (edges[..., :2, :, :, :] * edges[..., 1:, :, :, :]).sum(-3)
     return torch.stack([square[..., :2, :, :], mixed, square[..., 1:, :, :]], -4)
 
 
 def forces_of_stress(edges: Tensor, stress: Tensor) -> Tensor:
-    """`sum S_ij e_j` at the end of every edge `e_i` of a triangle, and the opposite at its beginning, summed: `[..., V, 3]`.
+    """Sum the nodal forces of a stress `S` over all triangles, `[..., V, 3]`.
 
-    Arguments: `edges` of `cell_edges`; `stress`, `S` with entries 11, 12, 22, `[..., 3, 2, m-1, n-1]`.
+    Every edge `e_i` of a triangle contributes `sum_j S_ij e_j` at its end and the opposite at its start.
+
+    Args:
+        edges: edges from `cell_edges`, `[..., 3, 3, m-1, n-1]`.
+        stress: entries 11, 12, 22 of `S`, `[..., 3, 2, m-1, n-1]`.
     """
     first, second = edges[..., :2, :, :, :], edges[..., 1:, :, :, :]
     s11, s12, s22 = (s.unsqueeze(-3) for s in stress.unbind(-4))

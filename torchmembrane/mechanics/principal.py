@@ -11,27 +11,28 @@ FIELDS = ("stretch", "tension")
 
 
 def principal_fields(elasticity: ElasticEnergy, membrane: Membrane, x: Tensor, name: str) -> Tensor:
-    """A field of the deformed membrane along its two principal directions, at the vertices.
+    """Return the principal stretches or tensions of the deformed membrane at its vertices.
 
-    "stretch": the length of a material line over that in the unstretched membrane, `l s_1` and `l s_2`, with the stretches
-    `s` from the rest state and its prestretch `l`. "tension": the force in the membrane per deformed length,
+    "stretch" is the ratio of the lengths of a material line in the deformed and in the unstretched membrane, `l s_1` and
+    `l s_2`, with the stretches `s` relative to the rest state and the prestretch `l`. "tension" is the force in the membrane
+    per deformed length,
 
         T_1 = dW/ds_1 / s_2 = 2 (s_1 / s_2) (dW/dI + s_2^2 dW/dD),
 
-    and `T_2` alike; of a sphere under the pressure p it is `p R / 2`. Both are constant on a triangle; a vertex has the mean of
-    the triangles around it, weighted by their areas at rest.
+    and likewise `T_2`; in a sphere of radius R under the pressure p it is `p R / 2`. Both are constant in each triangle. The
+    value at a vertex is the mean of the triangles around it, weighted by their areas at rest.
 
     Args:
-        elasticity: elasticity of the membrane.
+        elasticity: elastic energy of the membrane.
         membrane: the rest surface on the same grid.
         x: vertices `[..., V, 3]`.
         name: "stretch" | "tension".
 
     Returns:
-        `[..., V, 2]`, the direction of the larger stretch first; stretch without unit, tension in force / length.
+        `[..., V, 2]`, the direction of the larger stretch first; stretches are dimensionless, tensions in force / length.
 
     Raises:
-        MembraneError: another name.
+        MembraneError: the name is unknown.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -55,5 +56,5 @@ def principal_fields(elasticity: ElasticEnergy, membrane: Membrane, x: Tensor, n
 
 
 def _with_axis(derivative: Tensor) -> Tensor:
-    """For both directions; a constant stays a scalar."""
+    """Append an axis for the two directions; a scalar stays a scalar."""
     return derivative[..., None] if derivative.ndim else derivative

@@ -1,8 +1,8 @@
-"""Symmetric positive definite band matrices on a processor, by LAPACK: one call for what block elimination does in hundreds.
+"""Cholesky factorisation and solution of symmetric positive definite band matrices on the CPU by LAPACK.
 
-LAPACK takes one matrix at a time, with one thread, because for such small matrices further threads would only wait. The
-functions are operators of torch, so that a compiled graph may contain them; gradients are those of the solution, see
-`implicit.differentiable`.
+One LAPACK call replaces hundreds of operations of block elimination. LAPACK takes one matrix at a time, with one thread,
+because further threads would only wait for such small matrices. The functions are torch operators, so that a compiled graph can
+contain them; `implicit.differentiable` gives their gradients.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,25 +18,26 @@ from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 RIDGES = (0.0, 1e-6, 1e-5, 1e-4)
-"""Added, one instead of the other, to a diagonal about 1 of a matrix that rounding has left without a factor."""
+"""Values that are added to the diagonal, which is about 1: tried in turn until a Cholesky factor exists, because rounding
+errors may have made the matrix indefinite."""
 
 
 def is_supported(matrix: Tensor) -> bool:
-    """Whether these operators can be used: on a processor, without gradients, and not in an exported model."""
+    """Return whether these operators can be used: on the CPU, without gradients, and not in an exported model."""
     recorded = torch.is_grad_enabled() and matrix.requires_grad
     return matrix.device.type == "cpu" and not recorded and not torch.compiler.is_exporting()
 
 
 def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
-    """Cholesky factors of matrices; NaN for a matrix that is not positive definite.
+    """Return the Cholesky factors of band matrices; NaN for a matrix that is not positive definite.
 
     Args:
-        runs: runs of neighbouring diagonals, `[B, n, K]` each, with the entries of every row from left to right. All other
-            entries are zero.
-        starts: how far the first diagonal of each run is to the right of the main one; 0 for the first run.
+        runs: runs of adjacent diagonals, `[B, n, K]` each, with the entries of every row from left to right. All other entries
+            of the matrix are zero.
+        starts: offset of each run's first diagonal from the main diagonal, to the right; 0 for the first run.
 
     Returns:
-        `[B, n, k + 1]`: with `L L^T` the matrix, row by row the columns of `L` from the diagonal on.
+        `[B, n, k + 1]`: row `i` holds column `i` of the factor `L` of `L L^T`, from the diagonal down.
 
     Example:
         >>> factor([torch.tensor([[[4.0, 2.0], [5.0, 0.0]]])], [0])
@@ -48,7 +49,7 @@ def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
 
 
 def solve(factors: Tensor, b: Tensor) -> Tensor:
-    """Solutions for the rows of `b [B, C, n]`, from what `factor` gives.
+    """Return the solutions for the right-hand sides in the rows of `b [B, C, n]`, from the result of `factor`.
 
     Example:
         >>> solve(factor([torch.tensor([[[4.0, 2.0], [5.0, 0.0]]])], [0]), torch.tensor([[[6.0, 7.0]]]))
@@ -58,7 +59,7 @@ def solve(factors: Tensor, b: Tensor) -> Tensor:
     return solved
 
 
-# Defined one by one: `torch.library.custom_op` loads torch's compiler, which takes a second, at the first call.
+# The operators are defined one by one, because `torch.library.custom_op` loads torch's compiler at the first call: one second.
 torch.library.define("torchmembrane::band_factor", "(Tensor[] runs, SymInt[] starts) -> Tensor")
 torch.library.define("torchmembrane::band_solve", "(Tensor factors, Tensor b) -> Tensor")
 
@@ -112,7 +113,7 @@ def _(info: Any, dims: tuple[int | None, int | None], factors: Tensor, b: Tensor
 
 
 _alone = Lock()
-"""Held while there is one thread: of two that set it at once the later would take 1 for what was."""
+"""Held while BLAS is limited to one thread. If two threads set the limit at once, the second would take 1 for the old value."""
 _libraries = cache(lambda: ThreadpoolController().select(user_api="blas"))
 
 
@@ -124,5 +125,5 @@ def _one_thread() -> Iterator[None]:
 
 @cache
 def _lapack(name: str, dtype: torch.dtype) -> Any:
-    """LAPACK's function for a precision."""
+    """Return LAPACK's function of this name for a precision."""
     return get_lapack_funcs(name, dtype=torch.empty(0, dtype=dtype).numpy().dtype)

@@ -1,8 +1,9 @@
-"""Symmetric positive definite block-pentadiagonal systems, batched: elimination from both ends inwards, one block from each.
+"""Batched solution of symmetric positive definite block-pentadiagonal systems by elimination from both ends inwards.
 
-Their number is odd. Blocks come in pairs, the first and the last, the second and the last but one, and so on; then the one in
-the middle. With the last pair it is solved for as a whole. Inverse roots of the pivots are kept, so that solving takes only
-products. Both blocks of a pair are matrices of one batch: of `B` systems `[2 B, s, s]`, a system's two in turn.
+Each step eliminates a pair of blocks: the first and the last, then the second and the last but one, and so on. The number of
+blocks is odd; the one in the middle and the last pair are solved together as one dense matrix. The inverse roots of the pivots
+are stored, so that a solution takes only matrix products. The two blocks of a pair are adjacent matrices of one batch: for `B`
+systems `[2 B, s, s]`.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,8 +16,13 @@ from .inverse_root import inverse_root
 
 
 class Factor(NamedTuple):
-    """The pivots' inverse roots `[2 B, s, s]`, at last `[B, 3 s, 3 s]`; these times what couples them to the pair next to them
-    further in, and to the one after that, `[2 B, s, s]` each."""
+    """A factored matrix.
+
+    Attributes:
+        roots: inverse roots of the pivots, `[2 B, s, s]` each; the last one `[B, 3 s, 3 s]`.
+        near: products of the roots and the blocks that couple a pair to the next pair further in, `[2 B, s, s]` each.
+        far: the same for the pair after the next.
+    """
 
     roots: list[Tensor]
     near: list[Tensor]
@@ -24,11 +30,12 @@ class Factor(NamedTuple):
 
 
 def places(n: int) -> list[list[tuple[int, int]]]:
-    """Rows and columns of the blocks that each part of an elimination needs; (-1, -1) stands for a zero block.
+    """Return the row and column of each block that each part of an elimination needs; (-1, -1) is a zero block.
 
-    First those of the first pair, those between it and the second, and those of the second; with every pair that is eliminated
-    those between it and the pair after the next, between the next two, and of the last of these, in the end the one in the
-    middle and zero; then the one between the last pair.
+    The first part has the diagonal blocks of the first pair, the blocks that couple it to the second pair, and the diagonal
+    blocks of the second pair. Each following part `k` has the blocks that couple pair `k` to the two pairs before it, and the
+    diagonal blocks of pair `k`; for the block in the middle these are itself and zero. The last part is the block that couples
+    the two blocks of the last pair.
     """
     pairs = [(k, n - 1 - k) for k in range((n + 1) // 2)]
 
@@ -41,12 +48,12 @@ def places(n: int) -> list[list[tuple[int, int]]]:
 
 
 def factor(parts: Sequence[Tensor], dense: Callable[[Tensor], Tensor]) -> Factor:
-    """What `substitute` needs to solve `M x = b`.
+    """Factor `M` for `substitute`, which solves `M x = b`.
 
     Args:
-        parts: parts of `M`, as `places` lists them, best with a diagonal about 1.
-        dense: makes blocks `[K B, s, s]` of what a part `[B, ...]` has of `K` of them, which are a matrix's worth of memory if
-            all are there at once.
+        parts: parts of `M` in the order of `places`; the diagonal of `M` should be about 1.
+        dense: function that expands `K` compactly stored blocks `[B, ...]` of a part to `[K B, s, s]`. It is called for few
+            blocks at a time, because all dense blocks together would take as much memory as the full matrix.
     """
     pivot, beside, further_in = (dense(pair) for pair in parts[0].chunk(3, 1))
     found = Factor([], [], [])
@@ -63,12 +70,12 @@ def factor(parts: Sequence[Tensor], dense: Callable[[Tensor], Tensor]) -> Factor
 
 
 def _less(block: Tensor, left: Tensor, right: Tensor) -> Tensor:
-    """`block - left^T right`."""
+    """Return `block - left^T right`."""
     return torch.baddbmm(block, left.mT, right, alpha=-1)
 
 
 def _middle(pivot: Tensor, beside: Tensor, between: Tensor, across: Tensor) -> Tensor:
-    """The last pair and the block between them as one matrix."""
+    """Return the last pair and the block in the middle as one dense matrix `[B, 3 s, 3 s]`."""
     (first, last), (of_first, of_last) = (pair.unflatten(0, (-1, 2)).unbind(1) for pair in (pivot, beside))
     own = between.unflatten(0, (-1, 2)).sum(1)
     rows = (first, across, of_first), (across.mT, last, of_last), (of_first.mT, of_last.mT, own)
@@ -76,7 +83,7 @@ def _middle(pivot: Tensor, beside: Tensor, between: Tensor, across: Tensor) -> T
 
 
 def substitute(factor: Factor, b: Tensor) -> Tensor:
-    """Solutions for the rows of `b [B, n, C, s]`, blocks in the order of `inwards`."""
+    """Return the solutions for the right-hand sides in the rows of `b [B, n, C, s]`, with blocks in the order of `inwards`."""
     (*roots, middle), near, far = factor
     s, turns = b.shape[-1], len(near)
     *x, between = b.split([2] * (turns + 1) + [1], 1)
@@ -97,5 +104,5 @@ def substitute(factor: Factor, b: Tensor) -> Tensor:
 
 
 def _transposed(block: Tensor) -> Tensor:
-    """The transpose, but not by `mT`, which would make a second, aliased input of an input of a compiled region."""
+    """Return the transpose without `mT`, which would add a second, aliased input to a compiled region."""
     return block.transpose(-2, -1)

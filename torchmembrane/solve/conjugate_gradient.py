@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients with a fixed number of steps, batched over frames and right-hand sides."""
+"""Preconditioned conjugate gradient method with a fixed number of steps, batched over frames and right-hand sides."""
 
 from collections.abc import Callable
 
@@ -9,15 +9,15 @@ from torch import Tensor
 def conjugate_gradient(
     apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor], Tensor], b: Tensor, steps: int
 ) -> Tensor:
-    """Solve `A x = b` for symmetric positive definite `A`, each row of `b` by itself.
+    """Solve `A x = b` for symmetric positive definite `A`, independently for each row of `b`.
 
     Steps after convergence change nothing (a zero residual gives a zero step).
 
     Args:
-        apply: `A`, from `[..., N]` to `[..., N]`.
-        precondition: an approximate inverse of `A`, symmetric positive definite as well.
-        b: `[..., N]`.
-        steps: how many; fixed, so that the graph is static.
+        apply: function that multiplies by `A`, from `[..., N]` to `[..., N]`.
+        precondition: function that applies an approximate inverse of `A`, which must be symmetric positive definite too.
+        b: right-hand sides, `[..., N]`.
+        steps: number of steps; fixed, so that the graph is static.
 
     Returns:
         `x [..., N]`.

@@ -1,13 +1,14 @@
-"""Small dense systems, many at once, by elimination that torch.onnx can write."""
+"""Batched solution of small dense systems by an elimination that torch.onnx can export."""
 
 import torch
 from torch import Tensor
 
 
 def solve_positive(system: Tensor) -> Tensor:
-    """`x [n, k, ...]` with `matrix x = loads` from `system = [matrix, loads] [n, n + k, ...]`: Gauss-Jordan without pivoting.
+    """Solve `matrix x = loads` for `x [n, k, ...]`, given `system = [matrix, loads] [n, n + k, ...]`.
 
-    The matrix must be positive definite; the batch comes last, so that each row is one long vector.
+    The method is Gauss-Jordan elimination without pivoting, so the matrix must be positive definite. The batch dimensions come
+    last, so that each row is one long vector.
 
     Example:
         >>> solve_positive(torch.tensor([[2.0, 0.0, 6.0], [0.0, 4.0, 2.0]])).tolist()
@@ -22,7 +23,7 @@ def solve_positive(system: Tensor) -> Tensor:
 
 
 def solve_dense(matrix: Tensor, loads: Tensor) -> Tensor:
-    """`x [..., n, k]` with `matrix x = loads`, of positive definite `matrix [..., n, n]`: by LAPACK, in exported models by
+    """Solve `matrix x = loads [..., n, k]` with a positive definite `matrix [..., n, n]`: by LAPACK, or in exported models by
     `solve_positive`."""
     if torch.compiler.is_exporting():
         return solve_positive(torch.cat([matrix, loads], -1).movedim((-2, -1), (0, 1))).movedim((0, 1), (-2, -1))

@@ -1,4 +1,4 @@
-"""Symmetric systems of one unknown per inner vertex of a grid, from 5 x 5 stencils, by elimination over pairs of grid rows."""
+"""Symmetric systems with one unknown per inner vertex of a grid and 5 x 5 stencils: elimination of pairs of grid rows."""
 
 import numpy as np
 import torch
@@ -8,15 +8,17 @@ from torch import Tensor, nn
 from . import block_tridiagonal
 
 UPPER = ((0, 0), (0, 1), (0, 2), *((i, j) for i in (1, 2) for j in range(-2, 3)))
-"""Offsets from a vertex to itself and to those further on that a stencil joins it with; the others follow by symmetry."""
+"""Offsets from a vertex to itself and to the later vertices of its stencil; the entries for earlier ones follow by symmetry."""
 
 
 class GridSystem(nn.Module):
-    """`M x = b` on the `N = (m - 2) (n - 2)` inner vertices of an `m x n` grid, row by row; two grid rows are one block.
+    """Solver for `M x = b` on the `N = (m - 2) (n - 2)` inner vertices of an `m x n` grid, numbered row by row.
+
+    Two grid rows form one block.
 
     Args:
         grid: `(m, n)`.
-        free: `[N]` bool; the unknowns of the others are zero.
+        free: which inner vertices are free, `[N]` bool; the unknowns of the others are zero.
     """
 
     order: Tensor
@@ -43,11 +45,11 @@ class GridSystem(nn.Module):
         self.register_buffer("free", free.double())
 
     def factor(self, stencil: Tensor) -> tuple[Tensor, ...]:
-        """What `substitute` needs.
+        """Factor `M` for `substitute`.
 
         Args:
-            stencil: `[B, 13, N]`, the entries of `M` between every vertex and those at `UPPER` from it; entries for neighbours
-                outside the inner vertices, or for neighbours that are not free, are ignored.
+            stencil: entries of `M` between every vertex and its neighbours at the offsets `UPPER`, `[B, 13, N]`. Entries for
+                neighbours that are not inner vertices or not free are ignored.
         """
         scale = torch.where(self.free > 0, stencil[:, 0], 1.0).rsqrt()
         entries = torch.cat([stencil.flatten(1), torch.zeros_like(scale[:, :1]), torch.ones_like(scale[:, :1])], 1)
@@ -61,9 +63,9 @@ class GridSystem(nn.Module):
         return *roots, *couplings, scale
 
     def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
-        """Solutions `[B, C, N]` for `loads` of that shape."""
+        """Return the solutions `[B, C, N]` for `loads [B, C, N]`."""
         *blocks, scale = factor
-        roots = len(blocks) // 2 + 1  # and a coupling between two
+        roots = len(blocks) // 2 + 1  # the others are couplings, one less than roots
         scale = (scale * self.free)[:, None]
         padded = F.pad(scale * loads, (0, self.blocks * self.block_size - self.count))
         in_blocks = padded.unflatten(-1, (self.blocks, self.block_size)).transpose(1, 2).index_select(1, self.order)
@@ -72,12 +74,12 @@ class GridSystem(nn.Module):
 
 
 def _scatter_index(size: tuple[int, int], free: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Indices `[P, s, s]` of the entries of the blocks between `pairs [P, 2]` of grid row pairs: into the stencil `[13, N]`,
-    which is followed by a zero and a one."""
+    """Return the indices `[P, s, s]` that gather the entries of the blocks `pairs [P, 2]` (block row, block column) from the
+    flattened stencil `[13, N]`, which is followed by a zero and a one."""
     N, s = len(free), 2 * size[1]
     number = np.full((5, 5), -1)
     for k, offset in enumerate(UPPER):
-        number[offset] = k  # negative indices wrap: the opposite offset has its own place
+        number[offset] = k  # negative indices wrap around, so the opposite offset has its own entry
     p, q = (s * pairs.T[:, :, None] + np.arange(s))[:, :, :, None]
     q = q.swapaxes(1, 2)
     used = [(vertex < N) & free[vertex.clip(max=N - 1)] for vertex in (p, q)]

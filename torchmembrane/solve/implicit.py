@@ -1,4 +1,4 @@
-"""Solutions of symmetric systems, `dx = A^-1 (db - dA x)`, whose gradients do not differentiate the steps of the solver."""
+"""Implicit differentiation of solutions of symmetric systems: `dx = A^-1 (db - dA x)`, without differentiating the solver."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,18 +12,18 @@ Linear = Callable[[Tensor], Tensor]
 
 
 def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
-    """`x = solve(b)` with the gradients of the exact solution of `A x = b`.
+    """Return `x = solve(b)` with the gradients of the exact solution of `A x = b`.
 
-    The gradient of `x` passes through one more `solve` (`A` is symmetric) to the residual `b - A x`, and from there to `b` and
-    to whatever `A` depends on.
+    Backpropagation applies `solve` once more (`A` is symmetric) to the gradient of `x` and passes the result through the
+    residual `b - A x` to `b` and to everything that `A` depends on.
 
     Args:
-        solve: `A^-1`, itself without gradients.
-        apply: `A`, from `[..., N]` to `[..., N]`, with gradients.
-        b: `[..., N]`.
+        solve: function that applies `A^-1`; it is not differentiated.
+        apply: function that multiplies by `A`, from `[..., N]` to `[..., N]`; it is differentiated.
+        b: right-hand sides, `[..., N]`.
 
     Limitations:
-        First derivatives only: second ones raise a `MembraneError`, and there is no forward mode. They are as exact as `solve`.
+        Only first derivatives in reverse mode are available: second ones raise a `MembraneError`. They are as exact as `solve`.
 
     Example:
         >>> a, b = torch.tensor(2.0, requires_grad=True), torch.tensor([3.0])
@@ -40,7 +40,7 @@ def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
 
 
 class _Solution(torch.autograd.Function):
-    """The identity on `x`, with the gradients of `A^-1 residual`."""
+    """Identity function of `x` whose gradients are those of `A^-1 residual`."""
 
     generate_vmap_rule = True
 
@@ -62,7 +62,7 @@ class _Solution(torch.autograd.Function):
 
 
 class _Once(torch.autograd.Function):
-    """The identity on a gradient that refuses to be differentiated again."""
+    """Identity function of a gradient that raises an error if it is differentiated again."""
 
     generate_vmap_rule = True
 
@@ -77,6 +77,6 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         raise MembraneError(
-            "second derivatives of a reconstruction: its solves are differentiated once; expected first ones: leave out "
-            "create_graph, or take finite differences of the gradient"
+            "second derivatives of a reconstruction: its solves can only be differentiated once; expected first ones: leave "
+            "out create_graph, or take finite differences of the gradient"
         )

@@ -1,18 +1,21 @@
-"""Inverse roots of symmetric positive definite matrices, many at once: `R` with `R^T R = A^-1`.
+"""Inverse roots of symmetric positive definite matrices, batched: `R` with `R^T R = A^-1`.
 
-The remainder of a system after an elimination, `C - B^T A^-1 B = C - (R B)^T R B`, then stays positive where rounding of `A^-1`
-itself would make it indefinite: in float32 from conditions of some 1e5 on, as a contact on a nearly unstretched sheet has.
+The Schur complement of an elimination, computed as `C - B^T A^-1 B = C - (R B)^T R B`, stays positive definite where the
+rounding error of `A^-1` itself would make it indefinite: in float32 from condition numbers of about 1e5, which a contact on a
+nearly unstretched sheet has.
 
-A matrix is split into 2 x 2 blocks down to `LEAF` rows, so that most of the work is matrix products; a leaf's root is by its
-Cholesky factor. Where a runtime has none (ONNX) it is split down to `ITERATED_LEAF` rows, whose roots are by products as well:
-`R <- (a + b M + c M^2) R` with `M = R A R^T`, from `R = I`. Every eigenvalue `x^2` of `M` goes to that of `p(x) = a x + b x^3 +
-c x^5`, which is as near to 1 as such a polynomial can be from the least `x` that a condition allows to the largest; of
-polynomials so composed none do better (Amsel, Persson, Musco and Gower 2025, The Polar Express). As each step begins from `A`
-itself, what rounding does to one is taken back by the next.
+A matrix is split recursively into 2 x 2 blocks down to `LEAF` rows, so that most of the work is matrix products. The root of a
+leaf is the inverse of its Cholesky factor. In ONNX, which has no Cholesky factorisation, the matrix is split to `ITERATED_LEAF`
+rows, and the root of a leaf is found by products as well: `R <- (a + b M + c M^2) R` with `M = R A R^T`, starting from `R = I`.
+A step maps every eigenvalue `x^2` of `M` to `p(x)^2` with `p(x) = a x + b x^3 + c x^5`, the odd quintic that is closest to 1
+between the smallest `x` that the condition number allows and the largest. No other composition of such polynomials is closer to
+1 (Amsel, Persson, Musco and Gower 2025, The Polar Express). Because each step starts from `A` itself, it corrects the rounding
+errors of the steps before.
 
-Such a root is too small in the directions of eigenvalues far below the condition's. An eigenvalue that rounding has left below
-zero grows in its last steps, and may diverge where it is as large: then the root is that of a number above `A` (Gershgorin),
-as if something had been added to this leaf; what is solved stays a direction of descent.
+Such a root is too small in the directions of eigenvalues far below the largest one divided by `LARGEST_CONDITION`. A negative
+eigenvalue, caused by rounding, grows in the last steps and may diverge if its magnitude reaches this limit. In that case the
+root is that of an upper bound of the eigenvalues of `A` (Gershgorin), as if a positive matrix had been added to this leaf; the
+solution is still a descent direction.
 """
 
 import math
@@ -26,18 +29,18 @@ from torch import Tensor
 
 from ..control_flow import can_sync, onnx_function
 
-LEAF = 140  # rows: halves of a smaller one take no less time
-ITERATED_LEAF = 48
-LANES = 16  # numbers of a vector: products of 47 x 47 take onnxruntime half as long again as those of 48 x 48
-RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor: float32's share of rounding
+LEAF = 140  # rows; splitting a smaller matrix saves no time
+ITERATED_LEAF = 48  # rows, in exported models
+LANES = 16  # numbers per vector register: onnxruntime takes 1.5 times as long for products of 47 x 47 as for 48 x 48
+RIDGE = 1e-5  # relative to a leaf's largest eigenvalue, added if it has no Cholesky factor; covers float32's rounding errors
 LARGEST_CONDITION = {torch.float32: 1.2e5, torch.float64: 1e10}  # of a leaf
-LARGEST_NORM = 10.0  # of R, over the root of the largest condition: more is divergence
-EXCHANGES = 30  # of extrema, until a polynomial is found
-NARROW = 0.02  # interval about 1
+LARGEST_NORM = 10.0  # of R, relative to the square root of the largest condition; a larger norm means divergence
+EXCHANGES = 30  # of the extrema (Remez), to find one polynomial
+NARROW = 0.02  # length of an interval about 1 below which the quintic that is flat at 1 is used
 
 
 def inverse_root(matrix: Tensor) -> Tensor:
-    """`R` of symmetric positive definite `[..., n, n]`.
+    """Return the inverse root `R` of a symmetric positive definite `matrix [..., n, n]`.
 
     Example:
         >>> R = inverse_root(torch.tensor([[2.0, 1.0], [1.0, 1.0]]))
@@ -49,12 +52,12 @@ def inverse_root(matrix: Tensor) -> Tensor:
 
 
 def by_cholesky(matrix: Tensor) -> Tensor:
-    """The inverse of the Cholesky factor; if rounding has left a leaf without one, a `RIDGE` is added to its diagonal."""
+    """Return the inverse of the Cholesky factor. If rounding has made a leaf indefinite, `RIDGE` is added to its diagonal."""
     if matrix.shape[-1] > LEAF:
         return _by_parts(matrix, by_cholesky, LEAF)
     factor, info = torch.linalg.cholesky_ex(matrix)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    if not (info.is_cpu and can_sync(info)) or any(info.flatten().tolist()):  # elsewhere the wait costs more than a factor
+    if not (info.is_cpu and can_sync(info)) or any(info.flatten().tolist()):  # else waiting costs more than factoring again
         ridge = torch.where(info > 0, RIDGE * matrix.abs().sum(-1).amax(-1), 0.0)
         factor = torch.linalg.cholesky_ex(matrix + ridge[..., None, None] * one).L
     return torch.linalg.solve_triangular(factor, one.expand_as(matrix), upper=False)
@@ -62,7 +65,7 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 
 @onnx_function
 def by_products(matrix: Tensor) -> Tensor:
-    """`inverse_root` by matrix products.
+    """Return the inverse root, computed by matrix products.
 
     It is too small in the directions of eigenvalues below the largest one of a leaf divided by `LARGEST_CONDITION`.
     """
@@ -83,8 +86,8 @@ def by_products(matrix: Tensor) -> Tensor:
 
 
 def _by_parts(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor], leaf: int) -> Tensor:
-    """The inverse root from those of the first rows and of what is left of the others, about as many: as few leaves as can be,
-    their rows whole vectors where they can be."""
+    """Return the inverse root, computed from those of the upper left block and of its Schur complement, each with about half of
+    the rows. The split gives as few leaves as possible, with multiples of `LANES` rows where possible."""
     n = matrix.shape[-1]
     leaves = -(-n // leaf)
     cut = min(-(-(leaves // 2) * n // leaves // LANES) * LANES, leaves // 2 * leaf)
@@ -99,9 +102,10 @@ def _by_parts(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor], leaf: in
 
 
 class Steps(NamedTuple):
-    """Steps `R <- T R` without a product by a number: `T = (R A R^T - shift)^2 + offset`, the rest in `A` and `R`.
+    """Steps `R <- T R` without products with scalars: `T = (R A R^T - shift)^2 + offset`; `A` and `R` absorb scale factors.
 
-    With `c` in `M^2`, `r` in `R` of a step and `t` in its `T`, `c t r^4 = 1`, and the next step's `r` is that over `t`.
+    A step computes `R / r` and `t T` in place of `R` and `T`, where `c t r^4 = 1` with the coefficient `c` of `M^2`; the next
+    step has `r / t` in place of `r`.
     """
 
     first: float
@@ -111,7 +115,8 @@ class Steps(NamedTuple):
 
     @classmethod
     def to(cls, condition: float, rounding: float) -> "Steps":
-        """Steps for matrices with a condition number up to this, until the roots of all eigenvalues are 1 up to rounding."""
+        """Return the steps for matrices with a condition number up to `condition`, after which the square roots of all
+        eigenvalues of `M` are 1 up to `rounding`."""
         steps = quintics(condition**-0.5, rounding)
         t = [1.0]
         for (_, _, c), (_, _, following) in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
@@ -123,8 +128,8 @@ class Steps(NamedTuple):
 
 
 def quintics(low: float, rounding: float) -> list[tuple[float, float, float]]:
-    """`a, b, c` of odd polynomials `a x + b x^3 + c x^5` whose composition maps the interval from `low` to 1 to 1, up to
-    rounding."""
+    """Return the coefficients `a, b, c` of odd polynomials `a x + b x^3 + c x^5` whose composition maps all numbers from `low`
+    to 1 to 1, up to `rounding`."""
     found, high, error = [], 1.0, 1.0
     while error > rounding:
         a, b, c, error = _nearest_to_one(low, high)
@@ -134,8 +139,11 @@ def quintics(low: float, rounding: float) -> list[tuple[float, float, float]]:
 
 
 def _nearest_to_one(low: float, high: float) -> tuple[float, float, float, float]:
-    """`a, b, c` of the odd quintic nearest to 1 from `low` to `high`, and how far from it: as far at both ends and at the two
-    extrema between, from one side and the other in turn (Remez); of a short interval the one that is flat at 1."""
+    """Return the coefficients `a, b, c` and the largest error of the odd quintic that is closest to 1 from `low` to `high`.
+
+    The errors at both ends and at the two extrema between them are equal, with alternating signs (Remez). If the interval is
+    shorter than `NARROW`, it is the quintic whose first and second derivatives vanish at 1.
+    """
     if high - low < NARROW:
         return 15 / 8, -10 / 8, 3 / 8, 2.5 * (high - 1) ** 3
     least, most = low + (high - low) / 4, high - (high - low) / 4

@@ -1,4 +1,4 @@
-"""Linear systems with one or two borders, by solves with one symmetric positive definite matrix."""
+"""Bordered linear systems (one or two borders), reduced to solves with one symmetric positive definite matrix."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from .symmetric_2x2 import symmetric_solution
 
 
 class ConstrainedMinimum(NamedTuple):
-    """`y [..., N]` and the multiplier `[...]`; the fluid's pressure is minus the multiplier."""
+    """The minimiser `y [..., N]` and the Lagrange multiplier `[...]`; the fluid's pressure is minus the multiplier."""
 
     y: Tensor
     multiplier: Tensor
@@ -18,20 +18,20 @@ class ConstrainedMinimum(NamedTuple):
 def constrained_minimum(
     inverse_load: Tensor, inverse_gradient: Tensor, gradient: Tensor, target: Tensor, compliance: float | Tensor = 0.0
 ) -> ConstrainedMinimum:
-    """Minimiser of `1/2 y.K y - g.y` subject to `v.y = c` (eqs. 22, 25-27).
+    """Minimise `1/2 y.K y - g.y` subject to `v.y = c` (eqs. 22, 25-27).
 
-    With `C > 0` the constraint reads `v.y = c + C lambda` (a gas that yields). Stationarity is `K y = g - lambda v`, so
+    With `C > 0` the constraint is `v.y = c + C lambda` (a compressible gas). Stationarity is `K y = g - lambda v`, so
 
         lambda = (v.K^-1 g - c) / (v.K^-1 v + C)        (eq. 27 for C = 0)
 
     The indefinite KKT matrix is never formed.
 
     Args:
-        inverse_load: `K^-1 g [..., N]`.
-        inverse_gradient: `K^-1 v [..., N]`.
-        gradient: `v [..., N]`.
-        target: `c [...]`.
-        compliance: the constraint's, `C [...]`.
+        inverse_load: solution for the load, `K^-1 g [..., N]`.
+        inverse_gradient: solution for the constraint's gradient, `K^-1 v [..., N]`.
+        gradient: gradient of the constraint, `v [..., N]`.
+        target: right-hand side of the constraint, `c [...]`.
+        compliance: compliance of the constraint, `C [...]`.
 
     Example:
         >>> import torch
@@ -44,7 +44,7 @@ def constrained_minimum(
 
 
 class BorderedStep(NamedTuple):
-    """`step [..., N]`, and `rise [...]`, the increase of the second border's unknown."""
+    """The step `d [..., N]` of `solve_bordered`, and `rise [...]`, the increase `r` of the unknown of the border `m`."""
 
     step: Tensor
     rise: Tensor
@@ -53,15 +53,15 @@ class BorderedStep(NamedTuple):
 def solve_bordered(
     loads: Tensor, solved: Tensor, corner: Tensor, load: Tensor, compliance: Tensor, target: Tensor
 ) -> BorderedStep:
-    """Solve for `d`, `r` and a multiplier `lambda`
+    """Solve for `d`, `r` and the multiplier `lambda`:
 
         [M  m  n] [d     ]   [-g]
         [m' c  C] [r     ] = [ b]
         [n' C  0] [lambda]   [ t]
 
     Args:
-        loads: `[..., 3, N]`: `n`, `g`, `m`.
-        solved: `[..., 3, N]`: `M^-1` of them.
+        loads: the vectors `n`, `g`, `m`, `[..., 3, N]`.
+        solved: `M^-1` times each of them, `[..., 3, N]`.
         corner: `c [...]`.
         load: `b [...]`.
         compliance: `C`, `[...]` or `[]`.
@@ -75,10 +75,17 @@ def solve_bordered(
 def border_unknowns(
     products: Tensor, corner: Tensor, load: Tensor, compliance: Tensor, target: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """`lambda` and `r` of `solve_bordered`, `[...]` each, from the products of the loads (rows) with their solutions, `[..., 3,
-    3]`, and the other arguments."""
+    """Return `lambda` and `r` of `solve_bordered`, `[...]` each.
+
+    Args:
+        products: products of the loads (rows) with their solutions (columns), `[..., 3, 3]`.
+        corner: as for `solve_bordered`.
+        load: as for `solve_bordered`.
+        compliance: as for `solve_bordered`.
+        target: as for `solve_bordered`.
+    """
     nMn, nMg, nMm, _, _, _, _, mMg, mMm = products.flatten(-2).unbind(-1)
-    scale = nMn.abs().clamp_min(torch.finfo(nMn.dtype).tiny).rsqrt()  # of the multiplier: the determinant goes with length^10
+    scale = nMn.abs().clamp_min(torch.finfo(nMn.dtype).tiny).rsqrt()  # of lambda: the determinant is in length^10
     border, of_border = scale * (compliance - nMm), scale * (target + nMg)
     rise, multiplier = symmetric_solution(corner - mMm, border, -scale * scale * nMn, load + mMg, of_border)
     return scale * multiplier, rise

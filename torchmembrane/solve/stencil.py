@@ -1,8 +1,8 @@
-"""The seven-point stencil of a grid of triangles: every vertex inside the border and the six around it.
+"""The seven-point stencil of a triangulated grid: a vertex inside the border and its six neighbours, the one-ring.
 
-Fields over all `V` vertices are `[..., V, C]`; over the `N = (m - 2) (n - 2)` inner ones, row by row, `[..., N, C]` or,
-components first, `[..., C, N]`. The six, the one-ring, are in turn: `k`, `ONE_RING[i]` and `ONE_RING[i + 1]` are a triangle.
-Convolutions, slices and pads: no index arithmetic.
+Fields over all `V` vertices are `[..., V, C]`; fields over the `N = (m - 2) (n - 2)` inner vertices, numbered row by row, are
+`[..., N, C]` or, with components first, `[..., C, N]`. The neighbours are listed in cyclic order: a vertex, `ONE_RING[i]` and
+`ONE_RING[i + 1]` form a triangle. All operations are convolutions, slices and pads, without index arithmetic.
 """
 
 import torch
@@ -11,11 +11,11 @@ from torch import Tensor
 
 ONE_RING = ((1, 0), (1, 1), (0, 1), (-1, 0), (-1, -1), (0, -1))
 STENCIL = ((0, 0), *ONE_RING)
-FEW = 12  # planes: more are convolved faster by what begins later
+FEW = 12  # planes; for more of them oneDNN's convolution is faster, although it starts later
 
 
 def stencil_kernels() -> Tensor:
-    """Kernels for `apply_stencil` that pick the vertex itself and its six neighbours.
+    """Return kernels for `apply_stencil` that pick the vertex itself and its six neighbours.
 
     Returns:
         `[7, 3, 3]`, in the order of `STENCIL`.
@@ -31,11 +31,13 @@ def stencil_kernels() -> Tensor:
 
 
 def one_ring_edges() -> Tensor:
-    """Kernels for `apply_stencil`: the edges from a vertex to its six neighbours, and the chords from the neighbour after each
-    to that before it.
+    """Return kernels for `apply_stencil` that give edges and chords of the one-ring.
+
+    The edges lead from a vertex to its six neighbours. The chord of a neighbour leads from the neighbour after it to the one
+    before it.
 
     Returns:
-        `[12, 3, 3]`, the edges before the chords.
+        `[12, 3, 3]`, first the edges, then the chords.
 
     Example:
         >>> field = torch.arange(9, dtype=torch.float64)[:, None]
@@ -47,15 +49,15 @@ def one_ring_edges() -> Tensor:
 
 
 def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border: bool = True) -> Tensor:
-    """Combinations of the values around every vertex, zero beyond the border.
+    """Return weighted sums of the values around every vertex; values beyond the border are zero.
 
-    One convolution, many times faster in exported models than differences of slices.
+    This is one convolution, which in exported models is many times faster than differences of slices.
 
     Args:
-        field: `[..., V, C]`.
-        kernels: `[W, 3, 3]`.
+        field: vertex field, `[..., V, C]`.
+        kernels: weights of the sums, `[W, 3, 3]`.
         grid: `m, n` with `V = m n`.
-        border: False for the `N` inner vertices only.
+        border: whether to include the border; False for the `N` inner vertices only.
 
     Returns:
         Components first: `[..., C, W V]`, or without the border `[..., C, W N]`.
@@ -71,14 +73,15 @@ def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border:
 
 
 def convolved(planes: Tensor, kernels: Tensor, padding: int = 0) -> Tensor:
-    """`F.conv2d`. For a few small planes on a processor without gradients, torch's native kernel is called, because oneDNN's,
-    the default, needs 40 microseconds before it starts. In exported models, which have no convolution in double precision, that
-    is a product.
+    """Compute `F.conv2d` by the fastest implementation.
+
+    For a few small planes on the CPU and without gradients this is torch's native kernel, because the default, oneDNN's, needs
+    40 microseconds to start. In exported models in double precision, where ONNX has no convolution, it is a matrix product.
 
     Args:
-        planes: `[P, C, m, n]`.
+        planes: input planes, `[P, C, m, n]`.
         kernels: `[W, C, h, w]`.
-        padding: with zeros.
+        padding: number of zeros added at each side.
 
     Example:
         >>> convolved(torch.ones(1, 1, 3, 3), torch.ones(1, 1, 2, 2)).tolist()
@@ -93,10 +96,10 @@ def convolved(planes: Tensor, kernels: Tensor, padding: int = 0) -> Tensor:
 
 
 def convolved_by_product(planes: Tensor, kernels: Tensor) -> Tensor:
-    """`F.conv2d`, without padding, by a product of matrices.
+    """Compute `F.conv2d` without padding by a matrix product.
 
     Args:
-        planes: `[P, C, m, n]`.
+        planes: input planes, `[P, C, m, n]`.
         kernels: `[W, C, h, w]`.
     """
     (m, n), (h, w) = planes.shape[2:], kernels.shape[2:]
@@ -107,10 +110,10 @@ def convolved_by_product(planes: Tensor, kernels: Tensor) -> Tensor:
 
 
 def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """A vertex field at the inner vertices.
+    """Return the values of a vertex field at the inner vertices.
 
     Args:
-        field: `[..., V, C]`.
+        field: vertex field, `[..., V, C]`.
         grid: `m, n`.
 
     Returns:
@@ -125,10 +128,10 @@ def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def pad_border(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """A field of the inner vertices extended to all vertices by zeros on the border: the adjoint of `inner`.
+    """Extend a field of the inner vertices to all vertices by zeros on the border: the adjoint of `inner`.
 
     Args:
-        field: `[..., N, C]`.
+        field: field over the inner vertices, `[..., N, C]`.
         grid: `m, n`.
 
     Returns:

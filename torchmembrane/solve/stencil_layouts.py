@@ -1,4 +1,4 @@
-"""The matrix of a `StencilSystem` as solvers take it: blocks of grid rows, or a band; made of the vertices' blocks."""
+"""Two layouts of the matrix of a `StencilSystem`, assembled from the vertices' 3 x 3 blocks: blocks of grid rows, or a band."""
 
 from typing import NamedTuple
 
@@ -10,22 +10,23 @@ from torch import Tensor, nn
 from . import band, block_pentadiagonal
 from .block_tridiagonal import inwards
 
-NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its neighbours further on
+NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its later neighbours
 OFFSETS = (*NEAR, (0, 2), (1, -1), (1, 2), (2, 0), (2, 1), (2, 2))
-"""Between two vertices of a stencil, none beside its opposite."""
-REACH = 2  # lines, between two vertices of a stencil
+"""Offsets between two vertices of a stencil; of two opposite offsets only one is listed."""
+REACH = 2  # largest offset between two vertices of a stencil, grid lines
 WIDTH = 3 * (2 * REACH + 1) + 2
-"""Entries of a row of the matrix between two grid rows, each a place further to the left in the three rows of a vertex."""
+"""Stored entries per matrix row and neighbouring grid row. They are aligned with the diagonal, so those of a vertex's second
+and third rows start one and two places further to the left."""
 LEFT = 3 * REACH + 2
-"""Entries of a vertex's first row before the diagonal."""
+"""Stored entries to the left of the diagonal."""
 
 
 class RowBlocks(nn.Module):
-    """One block per grid row; the matrix is block pentadiagonal.
+    """Layout with one block per grid row: a block-pentadiagonal matrix.
 
     Args:
         grid: `(m, n)`.
-        free: `[N]` bool, which inner vertices are free.
+        free: which inner vertices are free, `[N]` bool.
     """
 
     order: Tensor
@@ -48,33 +49,34 @@ class RowBlocks(nn.Module):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
 
     def factor(self, entries: Tensor) -> block_pentadiagonal.Factor:
-        """What `substitute` needs, from the vertices' blocks, scaled, a zero and a one, `[B, 90 N + 2]`."""
+        """Factor the matrix for `substitute`; `entries [B, 90 N + 2]` are the scaled vertex blocks, a zero and a one."""
         matrix = entries.index_select(1, self.sources).unflatten(1, (-1, WIDTH))
         return block_pentadiagonal.factor(matrix.split(self.parts, 1), self.dense)
 
     def dense(self, rows: Tensor) -> Tensor:
-        """Blocks `[B K, s, s]` from their rows `[B, K s, 17]`, between a vertex and those at most `REACH` columns off.
+        """Return dense blocks `[B K, s, s]` from stored rows `[B, K s, 17]`, which reach `REACH` columns to either side.
 
-        Behind as many zeros as make a row of the matrix and one more, each lies where it belongs, but for a shift.
+        Every row is padded with zeros to `s + 1` entries. In the flattened array, each entry then lies at its place in the
+        dense block, except for a common shift.
         """
         size = 3 * self.columns
         whole = F.pad(rows, (0, size + 1 - WIDTH)).reshape(-1, size * (size + 1))
         return whole[:, LEFT : LEFT - size].unflatten(1, (size, size))
 
     def substitute(self, factor: block_pentadiagonal.Factor, loads: Tensor) -> Tensor:
-        """Solutions `[B, C, 3 N]` for `loads` of that shape."""
+        """Return the solutions `[B, C, 3 N]` for `loads [B, C, 3 N]`."""
         return self.from_blocks(block_pentadiagonal.substitute(factor, self.in_blocks(loads)))
 
     def in_blocks(self, vector: Tensor) -> Tensor:
-        """Vectors `[B, C, 3 N]` as blocks `[B, rows, C, s]` in the order of their elimination."""
+        """Arrange vectors `[B, C, 3 N]` as blocks `[B, rows, C, s]` in the order of elimination."""
         m, n = self.inner_grid
         field = F.pad(vector.unflatten(-1, (3, m, n)), (0, self.columns - n, 0, self.rows - m))
-        by_vertex = field.flatten(3).transpose(2, 3)  # an axis at a time: onnxruntime is slow at several
+        by_vertex = field.flatten(3).transpose(2, 3)  # axis by axis: onnxruntime is slow at several
         by_row = by_vertex.reshape(*by_vertex.shape[:2], self.rows, -1).transpose(1, 2)
         return by_row.index_select(1, self.order)
 
     def from_blocks(self, blocks: Tensor) -> Tensor:
-        """`in_blocks` undone."""
+        """Arrange blocks as vectors again: the inverse of `in_blocks`."""
         m, n = self.inner_grid
         by_row = blocks.index_select(1, self.place_of_row).transpose(1, 2)
         field = by_row.reshape(*by_row.shape[:2], -1, 3).transpose(2, 3).unflatten(-1, (self.rows, self.columns))
@@ -82,11 +84,11 @@ class RowBlocks(nn.Module):
 
 
 class Band(nn.Module):
-    """The unknowns in turn, vertex by vertex and grid row by grid row.
+    """Layout as a band matrix, with the unknowns ordered vertex by vertex and grid row by grid row.
 
     Args:
         grid: `(m, n)`.
-        free: `[N]` bool, which inner vertices are free.
+        free: which inner vertices are free, `[N]` bool.
     """
 
     sources: Tensor
@@ -103,12 +105,12 @@ class Band(nn.Module):
         self.widths = [WIDTH - LEFT, WIDTH, WIDTH]
 
     def factor(self, entries: Tensor) -> Tensor:
-        """As of `RowBlocks`."""
+        """Factor the matrix, as `RowBlocks.factor` does."""
         rows = entries.index_select(1, self.sources).unflatten(1, (-1, sum(self.widths)))
         return band.factor(rows.split(self.widths, 2), self.starts)
 
     def substitute(self, factor: Tensor, loads: Tensor) -> Tensor:
-        """As of `RowBlocks`."""
+        """Return the solutions `[B, C, 3 N]` for `loads [B, C, 3 N]`."""
         m, n = self.inner_grid
         field = F.pad(loads.unflatten(-1, (3, m, n)), (0, self.columns - n))
         solved = band.solve(factor, field.movedim(2, -1).flatten(2))
@@ -116,12 +118,12 @@ class Band(nn.Module):
 
 
 def enough_columns(n: int) -> int:
-    """No fewer than a row of the matrix reaches."""
+    """Return the number of columns to compute with: at least as many as a stored row of the matrix spans."""
     return max(n, 2 * REACH + 2)
 
 
 class Inner(NamedTuple):
-    """Rows and columns `[N]` of the inner vertices, and the number of a vertex at given ones, -1 outside."""
+    """Rows and columns `[N]` of the inner vertices; `at` gives the index of the vertex in a row and column, -1 outside."""
 
     row: np.ndarray
     column: np.ndarray
@@ -138,13 +140,16 @@ class Inner(NamedTuple):
 
 
 def _sources(inner_grid: tuple[int, int], free: np.ndarray, places: np.ndarray, columns: int) -> np.ndarray:
-    """Where the entries between the two grid rows of each of the `places [places, 2]` are, between the numbers of a vertex and
-    those of the ones at most `REACH` columns from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks
-    `[3, 3, 10, N]`, a zero and a one. Places of which a row is not there are zero."""
+    """Return the indices `[places, columns, 3, WIDTH]` that gather the stored matrix rows from the flattened vertex blocks
+    `[3, 3, 10, N]`, which are followed by a zero and a one.
+
+    Each of the `places [places, 2]` is a pair of grid rows. A stored row has the entries between an unknown of a vertex in the
+    first grid row and those of the vertices at most `REACH` columns away in the second. Places with a row of -1 are zero.
+    """
     inner, N, K = Inner.from_size(inner_grid), len(free), len(OFFSETS)
     number = np.full((2 * REACH + 1,) * 2, -1)
     for k, offset in enumerate(OFFSETS):
-        number[offset] = k  # negative indices wrap: the opposite offset has its own place
+        number[offset] = k  # negative indices wrap around, so the opposite offset has its own entry
     i, other = (at[:, None, None, None, None] for at in places.T)
     j, a, b = np.arange(columns)[:, None, None, None], np.arange(3)[:, None, None], np.arange(3)
     di, dj = other - i, np.arange(-REACH, REACH + 1)[:, None]

@@ -1,4 +1,4 @@
-"""Symmetric systems on a grid from products of seven-point stencils."""
+"""Symmetric systems on a grid whose matrices are products of seven-point stencils."""
 
 from typing import Any, NamedTuple
 
@@ -12,22 +12,26 @@ from .stencil import STENCIL
 from .stencil_layouts import OFFSETS, Band, Inner, RowBlocks
 
 SLOTS = sorted(range(len(STENCIL)), key=STENCIL.__getitem__)
-"""Places of a stencil in the order of the vertices: an offset leads from one to a later one, never its opposite."""
+"""Indices into `STENCIL` in the order of the vertices' numbers, so that the offset to a later one is in `OFFSETS`."""
 
 PAIRS = [(a, b) for k, a in enumerate(SLOTS) for b in SLOTS[k:]]
-"""Pairs of a stencil's vertices, each with itself and with the later ones."""
+"""Pairs of a stencil's vertices: each with itself and with the later ones."""
 
 
 class Matrix(NamedTuple):
-    """The blocks between the vertices and those at `OFFSETS` from them, scaled from both sides to a diagonal of 1, a zero and a
-    one, `[B, 90 N + 2]`; by what they are scaled, `[B, 1, 3 N]`."""
+    """A matrix that is scaled from both sides to a diagonal of 1.
+
+    Attributes:
+        entries: blocks between the vertices and their neighbours at `OFFSETS`, followed by a zero and a one, `[B, 90 N + 2]`.
+        scale: scale factors, `[B, 1, 3 N]`.
+    """
 
     entries: Tensor
     scale: Tensor
 
 
 class Factor(NamedTuple):
-    """The way a matrix was factored, what that keeps for its `substitute`, and the matrix' scale."""
+    """A factored matrix: its layout, the layout's factor for `substitute`, and the matrix's scale factors."""
 
     way: Band | RowBlocks
     kept: Any
@@ -35,13 +39,13 @@ class Factor(NamedTuple):
 
 
 class StencilSystem(nn.Module):
-    """Three unknowns per inner vertex of an `m x n` grid, solved by LAPACK where it can be, else by elimination over grid rows.
+    """Solver of systems with three unknowns per inner vertex of an `m x n` grid: LAPACK if possible, else block elimination.
 
     Vectors are fields `[3, N]` over the inner vertices, flattened.
 
     Args:
         grid: `(m, n)`.
-        free: `[N]` bool, which inner vertices are free. Columns of the others must be zero.
+        free: which inner vertices are free, `[N]` bool. Matrix columns of the others must be zero.
     """
 
     slots: Tensor
@@ -59,13 +63,13 @@ class StencilSystem(nn.Module):
         self.register_buffer("fixed", (~free).double())
 
     def matrix(self, stencils: Tensor, weights: Tensor, near: Tensor, damping: float | Tensor) -> Matrix:
-        """`A^T W A` and further blocks.
+        """Assemble `A^T W A` plus further blocks.
 
         Args:
-            stencils: `A [B, 3, 3, 7, N]`, of every vertex's three numbers, in the three of every vertex of its stencil.
-            weights: `W [B, 3, 3, N]`, symmetric.
-            near: `[B, 3, 3, K, N]`, the further blocks, between the vertices and those at the first `K` of `OFFSETS` from them.
-            damping: a share of the diagonal that is added.
+            stencils: `A [B, 3, 3, 7, N]`, derivatives of three values per vertex in the unknowns of its stencil's vertices.
+            weights: symmetric weights `W [B, 3, 3, N]`.
+            near: further blocks between the vertices and their neighbours at the first `K` of `OFFSETS`, `[B, 3, 3, K, N]`.
+            damping: relative increase of the diagonal.
         """
         blocks = self._blocks(stencils, weights)
         close = near.shape[3]
@@ -78,10 +82,11 @@ class StencilSystem(nn.Module):
         return Matrix(torch.cat([scaled, constants], 1), scale.flatten(1)[:, None])
 
     def _blocks(self, stencils: Tensor, weights: Tensor) -> Tensor:
-        """Blocks of `A^T W A`, `[B, 3, 3, 10, N]`, between the vertices and those at `OFFSETS` from them.
+        """Return the blocks of `A^T W A` between the vertices and their neighbours at `OFFSETS`, `[B, 3, 3, 10, N]`.
 
-        Both vertices are in the stencil of a third one. Grid rows between two zeros, two rows of zeros around all: so what
-        belongs with the stencil of a vertex at an offset is as far behind as that has places.
+        A block is a sum over all stencils that contain both vertices. Fields are padded by a column of zeros at each side and
+        two rows of zeros above and below. In the flattened field, a vertex at the offset `(i, j)` of a stencil is then always
+        `i n + j` entries after the stencil's centre.
         """
         n, (rows, _) = self.grid[1], self.inner_grid
         A = stencils.index_select(3, self.slots)
@@ -98,25 +103,26 @@ class StencilSystem(nn.Module):
         return inside[..., 1:-1].flatten(-2)
 
     def factor(self, matrix: Matrix) -> Factor:
-        """What `substitute` needs."""
+        """Factor the matrix for `substitute`."""
         way = self.band if band.is_supported(matrix.entries) else self.row_blocks
         return Factor(way, way.factor(matrix.entries), matrix.scale)
 
     def substitute(self, factor: Factor, loads: Tensor) -> Tensor:
-        """Solutions `[B, C, 3 N]` for `loads` of that shape."""
+        """Return the solutions `[B, C, 3 N]` for `loads [B, C, 3 N]`."""
         way, kept, scale = factor
         return scale * way.substitute(kept, scale * loads)
 
 
 def _ends(inner_grid: tuple[int, int]) -> np.ndarray:
-    """The numbers of every vertex' neighbours at `OFFSETS`, of some vertex where there is none, in fields `[3, N]`: `[3, 10,
-    N]`."""
+    """Return the indices `[3, 10, N]`, in a flattened field `[3, N]`, of every vertex's neighbours at `OFFSETS`; those of an
+    arbitrary vertex where there is no neighbour."""
     inner = Inner.from_size(inner_grid)
     beside = np.stack([inner.at(inner.row + i, inner.column + j) for i, j in OFFSETS]).clip(min=0)
     return beside + len(inner.row) * np.arange(3)[:, None, None]
 
 
 def _offsets_of_pairs() -> Tensor:
-    """`[10, 28]`: 1 where an offset is that between a pair of a stencil's vertices, the first by `SLOTS`, then the second."""
+    """Return a matrix `[10, 28]` that is 1 where an offset of `OFFSETS` leads from the first to the second vertex of a pair of
+    `PAIRS`."""
     pairs = [(STENCIL[a], STENCIL[b]) for a, b in PAIRS]
     return torch.tensor([[float((q[0] - p[0], q[1] - p[1]) == offset) for p, q in pairs] for offset in OFFSETS]).double()

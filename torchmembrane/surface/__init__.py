@@ -1,1 +1,1 @@
-"""The rest surface: shapes, the triangulated grid and its neighbourhoods, tangents, and projection onto the surface."""
+"""The rest surface: its shapes, the triangulated grid and its topology, tangents, and projection of points and rays onto it."""

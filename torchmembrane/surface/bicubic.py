@@ -1,7 +1,7 @@
-"""Bicubic interpolation of a grid's vertex fields: of fourth order, where linear triangles are of second order.
+"""Bicubic interpolation of vertex fields on a grid: fourth-order accurate, where linear triangles are second-order accurate.
 
-The displacement of a pressed membrane bends within a few lines of the grid; linear interpolation in a triangle is off by up to
-an eighth of its second difference.
+The displacement of a pressed membrane curves strongly within a few grid lines; the error of linear interpolation in a triangle
+is up to an eighth of its second difference.
 """
 
 import numpy as np
@@ -11,20 +11,20 @@ from torch import Tensor, nn
 
 from .projection import SurfacePoints
 
-BEYOND = (3.0, -3.0, 1.0)  # the line beyond the border, from the three at it: quadratic
+BEYOND = (3.0, -3.0, 1.0)  # weights of the three outermost lines in a quadratic extrapolation to the line beyond the border
 
 
 def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) -> np.ndarray:
-    """The shares of the vertices in a field at points of the surface, in the grid's own coordinates.
+    """Return the weights of the vertices that interpolate a field at points of the surface, bicubic in the grid's coordinates.
 
     Args:
-        points: points of the grid's triangles.
+        points: points on the grid's triangles.
         grid: `m, n`, at least 3 each.
-        fixed: `[V]` bool. Where it is more than the border, a field may have a kink: points near such vertices are linear in
-            their triangle.
+        fixed: which vertices are fixed, `[V]` bool. A field may have a kink at fixed vertices inside the border; points near
+            them are interpolated linearly in their triangle.
 
     Returns:
-        `[D, V]`, rows that sum to one; exact for cubics away from the border, for quadratics at it.
+        `[D, V]`, rows that sum to one. Interpolation is exact for cubics away from the border, for quadratics at the border.
 
     Example:
         >>> points = SurfacePoints(np.array([[0, 4, 5]]), np.array([[0.5, 0.25, 0.25]]), np.zeros(1))
@@ -40,15 +40,16 @@ def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
 
 
 def bicubic_slopes(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) -> np.ndarray:
-    """The shares of the vertices in a field's derivatives at points of the surface, along the grid's rows and columns.
+    """Return the weights of the vertices that give a field's derivatives at points of the surface in both grid coordinates.
 
     Args:
-        points: as of `bicubic_shares`.
-        grid: as of `bicubic_shares`.
-        fixed: as of `bicubic_shares`.
+        points: as for `bicubic_shares`.
+        grid: as for `bicubic_shares`.
+        fixed: as for `bicubic_shares`.
 
     Returns:
-        `[2, D, V]`, rows that sum to zero: the derivatives of what `bicubic_shares` interpolates, per step of the grid.
+        `[2, D, V]`, rows that sum to zero: the derivatives of the interpolation by `bicubic_shares` with respect to the row and
+        column number.
 
     Example:
         >>> points = SurfacePoints(np.array([[0, 4, 5]]), np.array([[0.5, 0.25, 0.25]]), np.zeros(1))
@@ -67,13 +68,13 @@ def bicubic_slopes(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
 
 
 def grid_coordinates(points: SurfacePoints, grid: tuple[int, int]) -> np.ndarray:
-    """Row and column, `[D, 2]`, of points of the surface, between the grid's lines."""
+    """Return the fractional row and column of points of the surface, `[D, 2]`."""
     place: np.ndarray = (points.weights[..., None] * np.stack(np.divmod(points.vertices, grid[1]), -1)).sum(1)
     return place
 
 
 def triangle_slopes(points: SurfacePoints, grid: tuple[int, int]) -> np.ndarray:
-    """Weights `[2, D, 3]` of the corners of the points' triangles in the derivatives of a field that is linear in each."""
+    """Return the weights `[2, D, 3]` of the triangles' corners that give the derivatives of a field linear in each triangle."""
     corners = np.stack(np.divmod(points.vertices, grid[1]), -1).astype(float)
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
     slopes: np.ndarray = np.concatenate([-inverse.sum(-1, keepdims=True), inverse], -1).swapaxes(0, 1)
@@ -81,13 +82,13 @@ def triangle_slopes(points: SurfacePoints, grid: tuple[int, int]) -> np.ndarray:
 
 
 def _products(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Shares `[D, m n]` of the vertices, of those of the lines in both directions."""
+    """Return the weights `[D, m n]` of the vertices: products of the weights of the grid lines in both directions."""
     products: np.ndarray = (rows[:, :, None] * columns[:, None]).reshape(len(rows), -1)
     return products
 
 
 def _is_kinked(shares: np.ndarray, grid: tuple[int, int], fixed: Tensor) -> np.ndarray:
-    """Which points have shares of fixed vertices that are not on the border, `[D]` bool."""
+    """Return which points depend on fixed vertices inside the border, `[D]` bool."""
     m, n = grid
     inside = np.zeros((m, n), bool)
     inside[1:-1, 1:-1] = fixed.numpy().reshape(m, n)[1:-1, 1:-1]
@@ -96,18 +97,18 @@ def _is_kinked(shares: np.ndarray, grid: tuple[int, int], fixed: Tensor) -> np.n
 
 
 def _linear(vertices: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
-    """Shares `[D, count]` that are the weights `[D, 3]` of triangles' corners."""
+    """Return weights `[D, count]` of all vertices, given the weights `[D, 3]` of the triangles' corners."""
     linear = np.zeros((len(vertices), count))
     np.add.at(linear, (np.arange(len(vertices))[:, None], vertices), weights)
     return linear
 
 
 class Refinement(nn.Module):
-    """Refine fields of a grid to a grid with more lines and the same border, by cubic convolution.
+    """Interpolate fields of a grid to a finer grid with the same border, by cubic convolution.
 
     Args:
-        grid: `m, n`.
-        finer: the same of the other grid.
+        grid: `m, n` of the given grid.
+        finer: `m, n` of the finer grid.
 
     Example:
         >>> Refinement((3, 3), (5, 3))(torch.tensor([0.0, 0, 0, 1, 1, 1, 0, 0, 0])[None, :, None].double())[0, ::3, 0].tolist()
@@ -125,13 +126,14 @@ class Refinement(nn.Module):
             self.register_buffer(name, F.interpolate(one, (more, lines), mode="bicubic", align_corners=True)[0, 0])
 
     def forward(self, field: Tensor) -> Tensor:
-        """`[B, V', C]` from `field [B, V, C]`."""
+        """Return the field `[B, V', C]` on the finer grid from `field [B, V, C]`."""
         finer: Tensor = self.rows @ field.unflatten(1, self.grid).permute(0, 3, 1, 2) @ self.columns.mT
         return finer.permute(0, 2, 3, 1).flatten(1, 2)
 
 
 def _along(place: np.ndarray, count: int, slopes: bool = False) -> np.ndarray:
-    """Shares `[D, count]` of the lines of one direction: Lagrange's polynomials of the four around, or their derivatives."""
+    """Return the weights `[D, count]` of the grid lines in one direction: the Lagrange polynomials of the four lines around a
+    point, or their derivatives."""
     first = np.clip(np.floor(place).astype(int), 0, count - 2)
     t = place - first
     cubic = -t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6
@@ -140,7 +142,7 @@ def _along(place: np.ndarray, count: int, slopes: bool = False) -> np.ndarray:
         cubic = outer, inner, -(3 * t**2 - 2 * t - 2) / 2, (3 * t**2 - 1) / 6
     shares, rows = np.zeros((len(place), count + 2)), np.arange(len(place))
     for k, share in enumerate(cubic):
-        shares[rows, first + k] = share  # a line beyond the border at each end
+        shares[rows, first + k] = share  # with one extra line beyond the border at each end
     for k, share in enumerate(BEYOND):
         shares[:, 1 + k] += share * shares[:, 0]
         shares[:, count - k] += share * shares[:, -1]

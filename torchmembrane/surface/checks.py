@@ -1,4 +1,4 @@
-"""Checks of a grid of vertices before it becomes a `Membrane`: finite, with a fixed rim, without folds, seen from inside."""
+"""Checks of a vertex grid before it becomes a `Membrane`: finite, with a fixed rim, without folds, seen from the inside."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -6,22 +6,22 @@ from numpy.typing import ArrayLike
 from ..errors import MembraneError, is_array
 
 FARTHEST = 1e6
-"""Coordinate, length unit."""
-SMALLEST_AREA = 1e-9  # of a triangle, over that of the largest
+"""Largest coordinate, length unit."""
+SMALLEST_AREA = 1e-9  # of a triangle, relative to that of the largest
 
 
 def checked_grid(vertices: ArrayLike, fixed: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and fixed ones of a grid as arrays.
+    """Return the vertices of a grid and the mask of the fixed ones as arrays.
 
     Args:
         vertices: `[m, n, 3]`, length unit.
-        fixed: `[m, n]` bool, or None: the border.
+        fixed: which vertices are fixed, `[m, n]` bool; None for the border.
 
     Returns:
-        `[m, n, 3]` float64 and `[m, n]` bool.
+        Vertices `[m, n, 3]` float64, and which are fixed, `[m, n]` bool.
 
     Raises:
-        MembraneError: another shape, a vertex that is not finite, a free border, no free vertex.
+        MembraneError: a wrong shape, a vertex that is not finite, a free border vertex, or no free vertex.
     """
     if not is_array(vertices):
         raise MembraneError(f"Membrane: vertices are a {type(vertices).__name__}; expected an array [m, n, 3] of numbers")
@@ -54,12 +54,12 @@ def checked_grid(vertices: ArrayLike, fixed: ArrayLike | None) -> tuple[np.ndarr
 
 
 def checked_orientation(X: np.ndarray, triangles: np.ndarray, fixed: np.ndarray) -> int:
-    """Which way the triangles face, seen from the camera at the origin.
+    """Return which way the triangles face, seen from the camera at the origin.
 
     Args:
         X: vertices `[V, 3]`.
-        triangles: `[T, 3]`, their vertices.
-        fixed: `[V]` bool; triangles whose vertices are all fixed are ignored.
+        triangles: vertex indices of the triangles, `[T, 3]`.
+        fixed: which vertices are fixed, `[V]` bool; triangles whose vertices are all fixed are ignored.
 
     Returns:
         +1 if the triangles already face away from the camera, -1 if all have to be flipped.
@@ -88,7 +88,7 @@ def checked_orientation(X: np.ndarray, triangles: np.ndarray, fixed: np.ndarray)
     if hidden.any():
         k = np.flatnonzero(free)[np.flatnonzero(hidden)[0]]
         raise MembraneError(
-            f"Membrane: {hidden.sum()} of {free.sum()} triangles turn their outside to the camera, the first one at vertices "
-            f"{triangles[k].tolist()}; expected a grid without folds whose inside is seen from the camera everywhere"
+            f"Membrane: {hidden.sum()} of {free.sum()} triangles show the camera their outer side, the first one at vertices "
+            f"{triangles[k].tolist()}; expected a grid without folds whose inner side is visible to the camera everywhere"
         )
     return outward

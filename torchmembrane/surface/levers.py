@@ -1,14 +1,14 @@
-"""Markers that stand off the surface, as pins and bumps do: each tip is the end of a lever that turns with what it stands on.
+"""Markers at a distance from the surface, such as the tips of pins and bumps: each is the end of a lever that turns with it.
 
-With the surface's tangents `a` and `b` along the grid's two directions at a marker's foot `x`, the tip is
+With the surface's tangents `a` and `b` along the grid's two directions at a marker's foot `x`, the tip is at
 
-    x + h n,    n = a x b / |a x b|,
+    x + h n,    n = a x b / |a x b|.
 
-and where the tangents change by `da` and `db` the normal changes by
+If the tangents change by `da` and `db`, the normal changes by
 
     dn = -(n . da) a* - (n . db) b*,    a* = b x n / |a x b|,  b* = n x a / |a x b|,
 
-the dual basis of the tangent plane. `h` is negative where `a x b` points to the other side.
+with the dual basis `a*`, `b*` of the tangent plane. `h` is negative where `a x b` points away from the tip.
 """
 
 from typing import NamedTuple
@@ -26,9 +26,9 @@ class Turned(NamedTuple):
     """Levers on a deformed surface.
 
     Attributes:
-        levers: from feet to tips, `[..., D, 3]`.
-        normal: `n`, `[..., D, 3]`.
-        dual: `a*` and `b*`, `[..., 2, D, 3]`.
+        levers: vectors from feet to tips, `[..., D, 3]`.
+        normal: unit normals `n`, `[..., D, 3]`.
+        dual: dual basis `a*` and `b*`, `[..., 2, D, 3]`.
     """
 
     levers: Tensor
@@ -37,17 +37,17 @@ class Turned(NamedTuple):
 
 
 class Levers(nn.Module):
-    """The levers of a surface's markers.
+    """Levers of the markers of a surface, which turn as the surface deforms.
 
     Args:
         membrane: the rest surface.
-        points: the markers' feet as points of it.
-        levers: from feet to tips at rest, `[D, 3]`; zero of markers that lie on the surface.
+        points: feet of the markers on the rest surface.
+        levers: vectors from feet to tips at rest, `[D, 3]`; zero for markers on the surface.
 
     Attributes:
-        slopes: `[2, D, V]`, the vertices' shares in the tangents.
-        tangents: `[2, D, 3]` at rest, those of the surface but for what of them is along a lever.
-        heights: `[D]`, along `a x b`.
+        slopes: weights of the vertices that give the tangents, `[2, D, V]`.
+        tangents: tangents of the rest surface without their components along the levers, `[2, D, 3]`.
+        heights: signed lengths of the levers along `a x b`, `[D]`.
 
     Example:
         >>> from torchmembrane.surface.shapes import heightfield
@@ -74,7 +74,7 @@ class Levers(nn.Module):
         self.register_buffer("heights", (torch.linalg.cross(*tangents) * along).sum(-1).sign() * length[:, 0])
 
     def forward(self, u: Tensor) -> Turned:
-        """The levers on the surface displaced by `u [..., V, 3]`."""
+        """Return the levers on the surface whose vertices are displaced by `u [..., V, 3]`."""
         moved = (self.slopes.flatten(0, 1) @ u).unflatten(-2, (2, -1))
         a, b = (self.tangents + moved).unbind(-3)
         across = torch.linalg.cross(a, b)
@@ -85,7 +85,7 @@ class Levers(nn.Module):
 
 
 def inward_levers(membrane: Membrane, points: SurfacePoints, heights: np.ndarray) -> np.ndarray:
-    """Levers `[D, 3]` of such `heights [D]` along the inward normals at points of the rest surface.
+    """Return levers `[D, 3]` of given `heights [D]` along the inward normals at points of the rest surface.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap

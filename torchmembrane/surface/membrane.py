@@ -1,6 +1,6 @@
 """The rest surface as a structured grid: triangles, rim, areas, normals, enclosed volume and its gradient.
 
-Which vertices form the triangles: `topology`. Sums around a vertex are convolutions of the grid: `stencil`.
+`topology` defines the triangles. Sums around a vertex are convolutions on the grid, see `solve.stencil`.
 """
 
 import copy
@@ -21,32 +21,33 @@ from .topology import corners, corners_to_vertices, rim_loop, triangles_of, tria
 
 
 class Membrane(nn.Module):
-    """A rest surface with a fixed rim, on an `m x n` grid in the camera's frame.
+    """A rest surface with a fixed rim, given as an `m x n` grid of vertices in the camera's frame.
 
-    Either winding is accepted; triangles are oriented outwards, away from the camera. Vertex `k = i n + j`, `V = m n` in all,
-    `T = 2 (m-1) (n-1)` triangles. In the methods `x [..., V, 3]` are vertices anywhere, of a batch of any shape.
+    Either winding is accepted; triangles are oriented outwards, away from the camera. Vertex `(i, j)` has the index `i n + j`;
+    there are `V = m n` vertices and `T = 2 (m-1) (n-1)` triangles. The methods take a deformed surface's vertices
+    `[..., V, 3]`.
 
     Args:
         vertices: `[m, n, 3]`, length unit.
-        fixed: `[m, n]` bool, vertices that do not move (default: the grid's border; the border is fixed always).
+        fixed: which vertices do not move, `[m, n]` bool; it must include the grid's border, which is the default.
 
     Attributes:
         grid: `m, n`.
-        outward: +1 where the grid as given has its triangles outwards, else -1.
+        outward: +1 if the triangles of the given grid face outwards, otherwise -1.
         rest: vertices `[V, 3]`.
-        triangles: `[T, 3]` int, their vertices in outward order.
-        fixed: `[V]` bool.
-        free_vertices: indices of those that are not fixed.
-        rest_area: `[V]`, lumped: a third of the triangles around the vertex.
-        rest_normals: `[V, 3]`, outward, of length one.
-        size: square root of the rest area, length unit: against it distances on this surface are small or large.
-        rest_volume: `[]`, between the rest surface and the camera's centre.
+        triangles: vertex indices of the triangles in outward order, `[T, 3]` int.
+        fixed: which vertices are fixed, `[V]` bool.
+        free_vertices: indices of the vertices that are not fixed.
+        rest_area: lumped area of every vertex, `[V]`: a third of the area of the triangles around it.
+        rest_normals: unit outward normals, `[V, 3]`.
+        size: square root of the rest area, length unit; the length scale of this surface.
+        rest_volume: volume between the rest surface and the camera's centre, `[]`.
 
     Raises:
         MembraneError: the grid folds, degenerates, has a free border or cannot be seen from the camera.
 
     Limitations:
-        Every point is seen from the camera, the origin: no undercuts.
+        Every point must be visible from the camera at the origin: undercuts are not possible.
 
     Example:
         >>> x, y = np.meshgrid(np.arange(5.0), np.arange(4.0), indexing="ij")
@@ -97,7 +98,7 @@ class Membrane(nn.Module):
         self.register_buffer("rest_volume", self.volume(rest))
 
     def area_vectors(self, x: Tensor) -> Tensor:
-        """Outward area vectors of all triangles: the normal times the area.
+        """Return the outward area vectors of all triangles: unit normal times area.
 
         Args:
             x: vertices `[..., V, 3]`.
@@ -117,7 +118,7 @@ class Membrane(nn.Module):
         return vectors
 
     def vertex_area(self, x: Tensor) -> Tensor:
-        """Lumped area of every vertex: a third of the triangles around it.
+        """Return the lumped area of every vertex: a third of the area of the triangles around it.
 
         Args:
             x: vertices `[..., V, 3]`.
@@ -135,7 +136,7 @@ class Membrane(nn.Module):
         return self.thirds_to_vertices(area).squeeze(-1)
 
     def normals(self, x: Tensor) -> Tensor:
-        """Unit outward normals at the vertices: of the area vectors summed around them, as the volume gradient's.
+        """Return unit outward normals at the vertices: the directions of the summed area vectors of the triangles around them.
 
         Args:
             x: vertices `[..., V, 3]`.
@@ -149,16 +150,16 @@ class Membrane(nn.Module):
             >>> cap.normals(cap.rest)[144].abs().round(decimals=6).tolist()
             [0.0, 0.0, 1.0]
         """
-        beyond = self.chords_beyond_border * torch.cat([x.transpose(-2, -1)] * 4, -1)  # vertices beyond are the vertex itself
+        beyond = self.chords_beyond_border * torch.cat([x.transpose(-2, -1)] * 4, -1)  # vertices beyond: the vertex itself
         along = self._crossed_chords(apply_stencil(x, self.chord_kernels, self.grid) - beyond)
         return (along * along.square().sum(-2, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny).rsqrt()).mT
 
     def volume(self, x: Tensor) -> Tensor:
-        """Volume between the surface and the camera's centre (eq. 19).
+        """Return the volume between the surface and the camera's centre (eq. 19).
 
-        `1/6 sum det [x_a, x_b, x_c]`, of the two triangles of a quadrilateral `det [a, b - d, c]`. Positive for outward
-        triangles: vertices run clockwise seen from the origin (the paper says counterclockwise). With a fixed rim the apex adds
-        a constant.
+        It is `1/6 sum det [x_a, x_b, x_c]`; the two triangles of a quadrilateral sum to `det [a, b - d, c]`. It is positive for
+        outward triangles, whose vertices run clockwise seen from the origin (the paper says counterclockwise). With a fixed
+        rim, another apex would change it by a constant.
 
         Args:
             x: vertices `[..., V, 3]`.
@@ -178,15 +179,15 @@ class Membrane(nn.Module):
         return self.outward / 6 * sixfold
 
     def volume_gradient(self, x: Tensor) -> Tensor:
-        """Derivative of `volume` in the vertices; the transposed cofactors of eq. 20.
+        """Return the gradient of `volume` with respect to the vertices; the transposed cofactors of eq. 20.
 
-        The six neighbours `p` in turn give `sum p_i x p_i+1 = (p_2 - p_0) x (p_3 - p_1) + (p_4 - p_0) x (p_5 - p_3)`.
+        With the six neighbours `p` in cyclic order, `sum p_i x p_i+1 = (p_2 - p_0) x (p_3 - p_1) + (p_4 - p_0) x (p_5 - p_3)`.
 
         Args:
             x: vertices `[..., V, 3]`.
 
         Returns:
-            `[..., V, 3]`, length unit squared; at inner vertices along the outward normal, as long as a third of the area.
+            `[..., V, 3]`, length unit squared; at inner vertices a third of the sum of the area vectors around the vertex.
 
         Example:
             >>> from torchmembrane.surface.shapes import heightfield
@@ -197,7 +198,7 @@ class Membrane(nn.Module):
         return self._crossed_chords(apply_stencil(x, self.chord_kernels, self.grid)).mT
 
     def volume_hessian_blocks(self, x: Tensor) -> Tensor:
-        """Second derivatives of every triangle's share of the volume in its nine vertex coordinates.
+        """Return the second derivatives of every triangle's share of the volume with respect to its nine vertex coordinates.
 
         Args:
             x: vertices `[..., V, 3]`.
@@ -209,12 +210,13 @@ class Membrane(nn.Module):
         return blocks
 
     def volume_one_ring(self, chords: Tensor) -> Tensor:
-        """Second derivatives of `volume` in an inner vertex and its six neighbours; those in one vertex alone are zero.
+        """Return the second derivatives of `volume` with respect to an inner vertex and each of its six neighbours.
 
-        Half of what they give of the edges to the neighbours is the gradient.
+        The second derivatives with respect to a vertex alone are zero. The gradient is half the sum of the blocks times the
+        edges to the neighbours.
 
         Args:
-            chords: `[..., 3, 6 N]`, from the neighbour after each to that before it (`one_ring_edges`).
+            chords: vectors from the neighbour after each neighbour to the one before it (`one_ring_edges`), `[..., 3, 6 N]`.
 
         Returns:
             `[..., 3, 3, 6, N]`.
@@ -224,25 +226,25 @@ class Membrane(nn.Module):
 
     @property
     def cavity_volume(self) -> float:
-        """Volume between the rest surface and a fan from the rim's centroid over its rim, in length unit cubed."""
+        """Volume between the rest surface and the fan of triangles from the rim to its centroid, length unit cubed."""
         rim = self.rest.cpu().double().numpy()[rim_loop(self.grid)]
         fan = np.cross(rim, np.roll(rim, -1, 0)) @ rim.mean(0)
         return float(self.rest_volume) - abs(float(fan.sum())) / 6
 
     @check_arguments
     def resampled(self, grid: tuple[int, int]) -> "Membrane":
-        """The same rest surface on another grid whose lines are equally spaced along the surface.
+        """Return the same rest surface on another grid whose lines are equally spaced along the surface.
 
-        Bicubic in the grid's own coordinates, so that the rim stays where it is.
+        The interpolation is bicubic in the grid's own coordinates, so that the rim stays where it is.
 
         Args:
-            grid: the new numbers of lines, at least 5 and 5.
+            grid: number of vertices in both directions of the new grid, at least 5 each.
 
         Returns:
-            Another `Membrane`.
+            The resampled `Membrane`.
 
         Raises:
-            MembraneError: fewer lines.
+            MembraneError: a grid with fewer than 5 vertices in a direction.
 
         Example:
             >>> from torchmembrane.surface.shapes import spherical_cap
@@ -255,11 +257,11 @@ class Membrane(nn.Module):
         return Membrane(*resampled_grid(X, self.fixed.cpu().numpy().reshape(self.grid), grid))
 
     def in_frame(self, pose: ViewPose, outside: bool = False) -> "Membrane":
-        """The same rest surface, its vertices in the same order, in another frame: of a view that may see a part of it only.
+        """Return the same rest surface, with vertices in the same order, in the frame of a view that may see only a part of it.
 
         Args:
-            pose: pose of this frame in the other one; it may reflect.
-            outside: whether the other view looks at the outer side, which is then away from its triangles' normals.
+            pose: pose of this frame in the other frame; it may contain a reflection.
+            outside: whether the other view sees the outer side of the surface; the normals then point to the inner side.
 
         Example:
             >>> from torchmembrane.surface.shapes import spherical_cap
@@ -278,13 +280,13 @@ class Membrane(nn.Module):
         return other
 
     def closest_points(self, points: ArrayLike) -> SurfacePoints:
-        """The material points of the rest surface closest to given ones.
+        """Return the points of the rest surface that are closest to given points.
 
         Args:
             points: `[D, 3]`, length unit, camera frame.
 
         Returns:
-            `SurfacePoints` with their distances.
+            `SurfacePoints` with the distances.
 
         Example:
             >>> from torchmembrane.surface.shapes import spherical_cap
@@ -295,14 +297,14 @@ class Membrane(nn.Module):
         return projection.closest_points(X, triangles, np.asarray(points, dtype=float))
 
     def ray_points(self, origins: ArrayLike, directions: ArrayLike) -> SurfacePoints:
-        """Where rays first meet the rest surface.
+        """Return the points where rays first meet the rest surface.
 
         Args:
-            origins: `[D, 3]`, length unit, camera frame.
-            directions: `[D, 3]`, of length one.
+            origins: origins of the rays, `[D, 3]`, length unit, camera frame.
+            directions: unit directions of the rays, `[D, 3]`.
 
         Returns:
-            `SurfacePoints`; `distance` is the range along the ray, NaN where it misses.
+            `SurfacePoints`; `distance` is the range along the ray, NaN where the ray misses.
 
         Example:
             >>> from torchmembrane.surface.shapes import spherical_cap
@@ -313,20 +315,20 @@ class Membrane(nn.Module):
         return projection.ray_points(X, triangles, np.asarray(origins, dtype=float), np.asarray(directions, dtype=float))
 
     def _chord_kernels(self) -> Tensor:
-        """Kernels for `apply_stencil`, `[4, 3, 3]`: chords across the one-ring `p`, the first two a sixth, outwards."""
+        """Return kernels for `apply_stencil`, `[4, 3, 3]`: chords of the one-ring `p`, the first two times `outward / 6`."""
         p = stencil_kernels()[1:]
         return torch.stack([self.outward / 6 * (p[2] - p[0]), self.outward / 6 * (p[4] - p[0]), p[3] - p[1], p[5] - p[3]])
 
     def _crossed_chords(self, chords: Tensor) -> Tensor:
-        """A sixth of `sum p_i x p_i+1` at every vertex, outwards, `[..., 3, V]`, from chords `[..., 3, 4 V]` as
-        `chord_kernels` has them."""
+        """Return a sixth of `sum p_i x p_i+1` at every vertex, pointing outwards, `[..., 3, V]`, from the chords
+        `[..., 3, 4 V]` of `chord_kernels`."""
         (u1, u2), (v1, v2) = (a.chunk(2, -2) for a in chords.index_select(-2, self.xyz_to_yzxzxy).chunk(2, -1))
         first, second = (u1 * v2 - u2 * v1).chunk(2, -1)
         crossed: Tensor = first + second
         return crossed
 
     def thirds_to_vertices(self, per_triangle: Tensor) -> Tensor:
-        """Sums `[..., V, C]` of a third of what the triangles around each vertex have, `[..., m-1, n-1, 2, C]`."""
+        """Return sums `[..., V, C]` of a third of the values `[..., m-1, n-1, 2, C]` of the triangles around each vertex."""
         thirds = (per_triangle / 3).unsqueeze(-2).expand(*per_triangle.shape[:-1], 3, per_triangle.shape[-1])
         return corners_to_vertices(triangles_to_corners(thirds), self.grid)
 
@@ -338,11 +340,11 @@ def _levi_civita() -> Tensor:
 
 
 def _cross_products() -> Tensor:
-    """`[9, 3]`: from `u` to the entries of the matrix of `u x`."""
+    """Return the matrix `[9, 3]` that maps `u` to the entries of its cross-product matrix `[u]x`."""
     return _levi_civita().transpose(1, 2).reshape(9, 3)
 
 
 def _determinant_derivatives() -> Tensor:
-    """Third derivatives `[9, 81]` of `det [a, b, c]` in its nine entries."""
+    """Return the third derivatives `[9, 81]` of `det [a, b, c]` with respect to its nine entries."""
     levi_civita = _levi_civita()
     return torch.einsum("uvw,ijk->uivjwk", levi_civita, levi_civita).reshape(9, 81)

@@ -1,6 +1,6 @@
-"""Projection onto a triangulated surface: the point closest to a given one, and the first point that a ray meets.
+"""Projection onto a triangulated surface: the closest point to a given point, and the first point that a ray meets.
 
-It is done once for a sensor with numpy, and is exact on the linear triangles.
+It is computed with numpy once for each sensor, and is exact on the linear triangles.
 """
 
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from ..solve.symmetric_2x2 import symmetric_adjugate_product, symmetric_determinant
 
-NEAREST = 24  # triangles, by their middles, among which the closest point is looked for
-CHUNK = 128  # rays that are tried against all triangles at a time
+NEAREST = 24  # triangles, by the distance of their centroids, in which the closest point is searched
+CHUNK = 128  # rays that are intersected with all triangles at a time
 EDGES = ((0, 1), (1, 2), (2, 0))
 
 
@@ -19,9 +19,9 @@ class SurfacePoints(NamedTuple):
     """Material points of a surface, each on one triangle.
 
     Attributes:
-        vertices: `[D, 3]` int, the vertices of the triangle.
-        weights: `[D, 3]`, barycentric.
-        distance: `[D]`, of what was projected to it (length unit), or the range along a ray; NaN where the ray misses.
+        vertices: vertex indices of the triangle, `[D, 3]` int.
+        weights: barycentric coordinates, `[D, 3]`.
+        distance: distance of the projected point (length unit), or the range along a ray, NaN where the ray misses; `[D]`.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -36,11 +36,11 @@ class SurfacePoints(NamedTuple):
 
 
 def closest_points(X: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> SurfacePoints:
-    """The material points closest to given ones.
+    """Return the points of a surface that are closest to given points.
 
     Args:
         X: vertices `[V, 3]`.
-        triangles: `[T, 3]`, their vertices.
+        triangles: vertex indices of the triangles, `[T, 3]`.
         points: `[D, 3]`.
 
     Returns:
@@ -58,13 +58,13 @@ def closest_points(X: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> 
 
 
 def ray_points(X: np.ndarray, triangles: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> SurfacePoints:
-    """The material points that rays meet first.
+    """Return the points of a surface that rays meet first.
 
     Args:
         X: vertices `[V, 3]`.
-        triangles: `[T, 3]`, their vertices.
-        origins: `[D, 3]`.
-        directions: `[D, 3]`, of length one.
+        triangles: vertex indices of the triangles, `[T, 3]`.
+        origins: origins of the rays, `[D, 3]`.
+        directions: unit directions of the rays, `[D, 3]`.
 
     Returns:
         `SurfacePoints` with the ranges along the rays, NaN for a ray that misses.
@@ -78,7 +78,8 @@ def ray_points(X: np.ndarray, triangles: np.ndarray, origins: np.ndarray, direct
 
 
 def _first_hits(start: np.ndarray, d: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First triangle met by every ray `[D, 1, 3]`, barycentric weights there, and the range (NaN: none). Moller-Trumbore."""
+    """Return the first triangle that every ray `[D, 1, 3]` meets, the barycentric coordinates there, and the range (NaN if
+    there is none), by the method of Moller and Trumbore."""
     a, b, c = triangles.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -95,9 +96,10 @@ def _first_hits(start: np.ndarray, d: np.ndarray, triangles: np.ndarray) -> tupl
 
 
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric weights and distance of the closest point of each triangle `[..., 3, 3]` to `p [..., 3]`.
+    """Return the barycentric coordinates and the distance of the point of each triangle `[..., 3, 3]` closest to `p [..., 3]`.
 
-    The foot in the triangle's plane where it lies inside, else the best of the feet on the three edges.
+    It is the orthogonal projection to the triangle's plane if that lies inside, otherwise the closest of the projections to the
+    three edges.
     """
     a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
     ab, ac, ap = b - a, c - a, p - a

@@ -1,4 +1,4 @@
-"""Resampling of a grid of vertices to other numbers of lines, equally spaced along the surface.
+"""Resampling of a vertex grid to another number of grid lines, equally spaced along the surface.
 
 scipy.interpolate is slow to import, and is loaded only where a grid is resampled.
 """
@@ -7,29 +7,30 @@ import numpy as np
 
 from ..errors import MembraneError
 
-FEWEST = 4  # lines that bicubic interpolation needs
-FINE = 40  # samples between two lines, for arc lengths
+FEWEST = 4  # lines needed for bicubic interpolation
+FINE = 40  # samples between two lines, to compute arc lengths
 
 
 def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """A grid's surface on another grid.
+    """Resample the surface of a grid on another grid.
 
-    Bicubic in the grid's own coordinates, so that the rim stays where it is; the new lines are at equal steps of the mean arc
-    length, so that steep sides, where the grid of a file is often coarse, get enough of them.
+    The interpolation is bicubic in the grid's own coordinates, so that the rim stays where it is. The new lines are at equal
+    steps of the mean arc length, so that steep sides, where the grid of a file is often coarse, get enough lines.
 
     Args:
         X: vertices `[m, n, 3]`.
-        fixed: `[m, n]` bool.
-        grid: the new numbers of lines.
+        fixed: which vertices are fixed, `[m, n]` bool.
+        grid: number of lines of the new grid in both directions.
 
     Returns:
-        Vertices `[*grid, 3]`, and which are fixed, `[*grid]`: the border, and inside it as the nearest vertex.
+        Vertices `[*grid, 3]`, and which are fixed, `[*grid]`: the border, and inner vertices whose nearest vertex in the given
+        grid is fixed.
 
     Raises:
-        MembraneError: fewer than 4 lines.
+        MembraneError: the given grid has fewer than 4 lines in a direction.
     """
     if min(X.shape[:2]) < FEWEST:
-        raise MembraneError(f"Membrane: {X.shape[0]} x {X.shape[1]} lines; expected at least {FEWEST} each way to interpolate")
+        raise MembraneError(f"Membrane: {X.shape[0]} x {X.shape[1]} lines; expected at least {FEWEST} in each direction")
     lines = even_lines(X, grid[0]), even_lines(X.swapaxes(0, 1), grid[1])
     vertices = on_lines(X, lines)
     rows, columns = (np.rint(line[1:-1]).clip(1, count - 2).astype(int) for line, count in zip(lines, X.shape[:2], strict=True))
@@ -39,11 +40,11 @@ def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> t
 
 
 def on_lines(X: np.ndarray, lines: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """A grid's values between its lines, by bicubic interpolation in the line numbers.
+    """Interpolate a grid's values between its lines, bicubic in the line numbers.
 
     Args:
-        X: `[m, n, 3]`, 4 lines or more each way.
-        lines: where the new lines are, `[M]` in 0..m - 1 and `[N]` in 0..n - 1.
+        X: values `[m, n, 3]`, at least 4 lines in both directions.
+        lines: fractional line numbers of the new lines, `[M]` in 0..m - 1 and `[N]` in 0..n - 1.
 
     Returns:
         `[M, N, 3]`.
@@ -60,13 +61,13 @@ def on_lines(X: np.ndarray, lines: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
 
 
 def at_equal_steps(X: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """A grid's values `[m, n, 3]` on other numbers of lines, at equal steps of its own lines, `[*grid, 3]`."""
+    """Interpolate a grid's values `[m, n, 3]` to `[*grid, 3]`, with new lines at equal steps of the line number."""
     m, n = X.shape[:2]
     return on_lines(X, (np.linspace(0, m - 1, grid[0]), np.linspace(0, n - 1, grid[1])))
 
 
 def even_lines(X: np.ndarray, count: int) -> np.ndarray:
-    """Coordinates along the first axis of `X [m, n, 3]` of `count` lines at equal rms distance from line to line.
+    """Return the fractional line numbers, along the first axis of `X [m, n, 3]`, of `count` lines with equal rms spacing.
 
     Example:
         >>> x = np.array([0.0, 1.0, 2.0, 4.0, 6.0])

@@ -1,7 +1,7 @@
-"""Rest surfaces by formula: spherical cap, ellipsoid cap, half cylinder, height field.
+"""Rest surfaces given by formulas: spherical cap, ellipsoid cap, half cylinder, height field.
 
-Round rims are mapped to the border of a square grid by the elliptical map `x = u sqrt(1 - v^2/2)`, `y = v sqrt(1 - u^2/2)`,
-smooth inside; then the radius is taken as an angle, so that the mesh does not coarsen towards steep sides.
+The elliptical map `x = u sqrt(1 - v^2/2)`, `y = v sqrt(1 - u^2/2)` maps the border of a square grid to a circular rim and is
+smooth inside. The radius is then used as the polar angle, so that the mesh does not coarsen towards steep sides.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ LEAST_LENGTH = 1e-6
 
 
 def disc_grid(m: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates of a grid over the unit disc whose border is the unit circle.
+    """Return the coordinates of a grid over the unit disc whose border is the unit circle.
 
     Args:
-        m: lines along x.
-        n: lines along y.
+        m: number of vertices along x.
+        n: number of vertices along y.
 
     Returns:
-        `x, y`, each `[m, n]`.
+        `x` and `y`, `[m, n]` each.
 
     Example:
         >>> x, y = disc_grid(3, 3)
@@ -37,19 +37,19 @@ def disc_grid(m: int, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 @check_arguments
 def spherical_cap(rim_radius: float, height: float, base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
-    """The cap of a sphere over its circular rim, bulging away from the camera.
+    """Return a spherical cap over a circular rim, bulging away from the camera.
 
     Args:
-        rim_radius: length unit.
-        height: height of the pole above the rim.
-        base_z: the rim's z.
-        grid: vertices along x and y.
+        rim_radius: radius of the rim, length unit.
+        height: height of the pole above the rim, length unit.
+        base_z: z coordinate of the rim, length unit.
+        grid: number of vertices along x and y.
 
     Returns:
         The `Membrane`.
 
     Raises:
-        MembraneError: a length is not finite and positive, or the camera does not see all of the surface from within.
+        MembraneError: a length is not finite and positive, or the camera does not see the whole inner side of the surface.
 
     Example:
         >>> spherical_cap(rim_radius=12.0, height=9.0, base_z=15.0).rest[:, 2].max().item()
@@ -63,18 +63,18 @@ def spherical_cap(rim_radius: float, height: float, base_z: float, grid: tuple[i
 
 @check_arguments
 def ellipsoid_cap(semi_axes: Sequence[float], base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
-    """The upper half of an ellipsoid over its elliptic rim, bulging away from the camera.
+    """Return the upper half of an ellipsoid over an elliptic rim, bulging away from the camera.
 
     Args:
-        semi_axes: `a, b, c` along x, y, z, length unit.
-        base_z: the rim's z.
-        grid: vertices along x and y.
+        semi_axes: semi-axes `a, b, c` along x, y, z, length unit.
+        base_z: z coordinate of the rim, length unit.
+        grid: number of vertices along x and y.
 
     Returns:
         The `Membrane`.
 
     Raises:
-        MembraneError: an axis is not finite and positive, or the camera does not see all of the surface from within.
+        MembraneError: an axis is not finite and positive, or the camera does not see the whole inner side of the surface.
 
     Example:
         >>> ellipsoid_cap([10.0, 8.0, 12.0], base_z=3.0).rest[:, 2].max().round(decimals=9).item()
@@ -87,20 +87,21 @@ def ellipsoid_cap(semi_axes: Sequence[float], base_z: float, grid: tuple[int, in
 
 @check_arguments
 def half_cylinder(radius: float, length: float, half_angle: float, base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
-    """A cylinder along x, bulging away from the camera.
+    """Return a part of a cylinder along x, bulging away from the camera.
 
     Args:
-        radius: length unit.
-        length: along x.
-        half_angle: to both sides of the top, degrees, at most 90.
-        base_z: the long edges' z.
-        grid: vertices along x and around.
+        radius: radius of the cylinder, length unit.
+        length: length along x, length unit.
+        half_angle: angle from the top line to either long edge, degrees, at most 90.
+        base_z: z coordinate of the long edges, length unit.
+        grid: number of vertices along x and around the cylinder.
 
     Returns:
         The `Membrane`.
 
     Raises:
-        MembraneError: a value is not finite and positive, the angle too large, or the surface not seen from within.
+        MembraneError: a value is not finite and positive, the angle is too large, or the camera does not see the whole inner
+            side of the surface.
 
     Example:
         >>> half_cylinder(radius=10.0, length=36.0, half_angle=90.0, base_z=24.0).rest[:, 2].max().item()
@@ -118,18 +119,18 @@ def half_cylinder(radius: float, length: float, half_angle: float, base_z: float
 
 @check_arguments
 def heightfield(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Membrane:
-    """A surface of heights over a rectangle; its border is the rim.
+    """Return a surface given by its z coordinates over a rectangle, whose border is the rim.
 
     Args:
-        x: `[m]`, increasing, length unit.
-        y: `[n]`, increasing.
-        z: `[m, n]`.
+        x: increasing coordinates `[m]`, length unit.
+        y: increasing coordinates `[n]`, length unit.
+        z: z coordinates `[m, n]`, length unit.
 
     Returns:
         The `Membrane`.
 
     Raises:
-        MembraneError: shapes that do not belong together, coordinates that do not increase.
+        MembraneError: the shapes do not match, or the coordinates do not increase.
 
     Example:
         >>> heightfield([0, 1, 2], [0, 1, 2, 3], np.full((3, 4), 5.0)).grid

@@ -1,7 +1,7 @@
-"""Two unit vectors across a direction: the tangent frame of a normal, the two angles of a ray.
+"""Two unit vectors orthogonal to a direction: the tangent frame of a normal, or the two axes for the angles of a ray.
 
 Any two unit vectors that are orthogonal to the direction and to each other will do; no result may depend on their rotation
-about the direction. There is one rule for torch and another one for numpy. Both are kept, because the sampling points of
+about the direction. The functions for torch and for numpy use different rules. Both are kept, because the sampling points of
 calibrated surfaces and of dots' outlines follow these frames.
 """
 
@@ -10,23 +10,24 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-ALONG_Z = 0.9  # directions with a larger |z| are crossed with the x axis, others with the z axis
+ALONG_Z = 0.9  # the cross product with the x axis is used for directions with a larger |z|, else that with the z axis
 
 
 def tangent_frame(directions: Tensor, dim: int = -1) -> Tensor:
-    """Two unit vectors across each unit direction, computed without a branch because exported models contain it.
+    """Return two unit vectors orthogonal to each unit direction, computed without a branch because exported models use it.
 
-    The first is `d x e / |d x e|` with the axis `e = z`, or `x` for directions close to `z`; the second `d x` the first.
+    The first is `d x e / |d x e|`, where `e` is the z axis, or the x axis for directions close to z. The second is the cross
+    product of `d` and the first.
 
     Args:
-        directions: unit vectors, x y z along `dim`: `[..., 3]`, or components first, `[B, 3, D]` with `dim=1`.
-        dim: the axis of the components.
+        directions: unit vectors with components along `dim`: `[..., 3]`, or with components first `[B, 3, D]` and `dim=1`.
+        dim: axis of the components.
 
     Returns:
         The two vectors along a new axis before that of the components: `[..., 2, 3]`, or `[B, 2, 3, D]`.
 
     Limitations:
-        Turns abruptly where `|z|` passes 0.9: not for what is differentiated across there.
+        The frame is discontinuous where `|z|` passes 0.9; do not differentiate across that point.
 
     Example:
         >>> tangent_frame(torch.tensor([[1.0, 0.0, 0.0]])).tolist()
@@ -41,10 +42,12 @@ def tangent_frame(directions: Tensor, dim: int = -1) -> Tensor:
 
 
 def tangent_axes(normals: np.ndarray) -> np.ndarray:
-    """Two unit vectors across each unit normal, as numpy arrays: the first across the axis of its least component.
+    """Return two unit vectors orthogonal to each unit normal, as numpy arrays.
+
+    The first is also orthogonal to the coordinate axis of the normal's smallest component.
 
     Args:
-        normals: `[D, 3]`, of length one.
+        normals: unit normals, `[D, 3]`.
 
     Returns:
         `[D, 2, 3]`.

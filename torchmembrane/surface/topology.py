@@ -1,8 +1,9 @@
-"""Which vertices of the grid form its quadrilaterals, its triangles and its rim.
+"""Topology of the grid: the vertices of its quadrilaterals, its triangles and its rim.
 
-Vertex `k = i n + j` of an `m x n` grid; quadrilateral `(i, j)` has the corners `a = (i, j)`, `b = (i+1, j)`, `c = (i+1, j+1)`,
-`d = (i, j+1)` and is split along `a c` everywhere (alternating diagonals bias the pressure). Gathering corners and summing
-back to vertices are slices and pads: no index arithmetic, hence cheap to export.
+Vertex `(i, j)` of an `m x n` grid has the index `i n + j`. Quadrilateral `(i, j)` has the corners `a = (i, j)`,
+`b = (i+1, j)`, `c = (i+1, j+1)`, `d = (i, j+1)`. All quadrilaterals are split along `a c`, because alternating diagonals would
+bias the pressure. Corners are gathered, and summed back to vertices, by slices and pads without index arithmetic, which is
+cheap in exported models.
 """
 
 import numpy as np
@@ -14,10 +15,10 @@ TRIANGLE_CORNERS = ((0, 1, 2), (0, 2, 3))
 
 
 def corners(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Values at the corners a, b, c, d of every quadrilateral.
+    """Return a vertex field's values at the corners a, b, c, d of every quadrilateral.
 
     Args:
-        field: `[..., V, C]`, one row per vertex.
+        field: vertex field `[..., V, C]`.
         grid: `m, n` with `V = m n`.
 
     Returns:
@@ -32,10 +33,10 @@ def corners(field: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def corners_to_vertices(values: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Sum of corner values at every vertex, the adjoint of `corners`.
+    """Sum corner values at every vertex: the adjoint of `corners`.
 
     Args:
-        values: `[..., m-1, n-1, 4, C]`.
+        values: corner values, `[..., m-1, n-1, 4, C]`.
         grid: `m, n`.
 
     Returns:
@@ -52,10 +53,10 @@ def corners_to_vertices(values: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def triangles_of(values: Tensor) -> Tensor:
-    """Corner values of both triangles of every quadrilateral.
+    """Return the corner values of both triangles of every quadrilateral.
 
     Args:
-        values: `[..., 4, C]`, as `corners` gives them.
+        values: corner values of the quadrilaterals from `corners`, `[..., 4, C]`.
 
     Returns:
         `[..., 2, 3, C]`, in the order of `TRIANGLE_CORNERS`.
@@ -68,10 +69,10 @@ def triangles_of(values: Tensor) -> Tensor:
 
 
 def triangles_to_corners(values: Tensor) -> Tensor:
-    """Sum of both triangles' values at the corners of their quadrilateral, the adjoint of `triangles_of`.
+    """Sum the values of both triangles at the corners of their quadrilateral: the adjoint of `triangles_of`.
 
     Args:
-        values: `[..., 2, 3, C]`.
+        values: corner values of the triangles, `[..., 2, 3, C]`.
 
     Returns:
         `[..., 4, C]`.
@@ -86,13 +87,13 @@ def triangles_to_corners(values: Tensor) -> Tensor:
 
 
 def grid_triangles(grid: tuple[int, int]) -> np.ndarray:
-    """The vertices of all triangles of a grid, those of a quadrilateral one after the other.
+    """Return the vertex indices of all triangles of a grid; the two triangles of a quadrilateral are adjacent.
 
     Args:
         grid: `m, n`.
 
     Returns:
-        `[2 (m-1) (n-1), 3]`, in the grid's own winding.
+        Vertex indices `[2 (m-1) (n-1), 3]`, in the grid's own winding.
 
     Example:
         >>> grid_triangles((2, 2)).tolist()
@@ -104,13 +105,13 @@ def grid_triangles(grid: tuple[int, int]) -> np.ndarray:
 
 
 def rim_loop(grid: tuple[int, int]) -> np.ndarray:
-    """The vertices of the grid's border, once around, each once.
+    """Return the vertices of the grid's border in cyclic order, each once.
 
     Args:
         grid: `m, n`.
 
     Returns:
-        Vertex indices `[2 (m + n) - 4]`, from vertex 0 along `a b` first; repeat the first one to close the loop.
+        Vertex indices `[2 (m + n) - 4]`, starting at vertex 0 in the direction `a b`; repeat the first one to close the loop.
 
     Example:
         >>> rim_loop((3, 3)).tolist()

@@ -1,1 +1,1 @@
-"""Force balance: few, compressive contact forces explain what the markers show."""
+"""Force balance: sparse, compressive contact forces explain the observed markers."""

@@ -1,6 +1,6 @@
-"""The force that something outside must exert on every vertex, and its tangent stiffness.
+"""The contact force that acts on every vertex from outside, and its tangent stiffness.
 
-With the elastic energy `U`, the rest load `h`, the pressure `p` and the volume `V`, contact force `= grad U - h - p grad V`.
+With the elastic energy `U`, the rest load `h`, the pressure `p` and the volume `V`, it is `grad U - h - p grad V`.
 """
 
 from typing import NamedTuple
@@ -15,9 +15,15 @@ from ...surface.membrane import Membrane
 
 
 class Linearised(NamedTuple):
-    """At the inner vertices: the contact `force [B, 3, N]`, its tangent `stiffness [B, 3, 3, 7, N]` (of a component, in one, of
-    a vertex of the stencil), the gradient of the `volume [B, 3, N]`, the outward `normal [B, 3, N]`. All but the normal zero
-    at, and in, vertices that are not free. The stiffness is the Hessian of an energy: symmetric."""
+    """The contact force linearised at the inner vertices; all but the normal are zero for vertices that are not free.
+
+    Attributes:
+        force: contact forces, `[B, 3, N]`.
+        stiffness: tangent stiffness, `[B, 3, 3, 7, N]`: derivatives of a force component in the components of the vertices of
+            its stencil. It is symmetric, because it is the Hessian of an energy.
+        volume: gradient of the volume, `[B, 3, N]`.
+        normal: outward unit normals, `[B, 3, N]`.
+    """
 
     force: Tensor
     stiffness: Tensor
@@ -26,13 +32,13 @@ class Linearised(NamedTuple):
 
 
 class ContactForce(nn.Module):
-    """Contact forces of a membrane of given material.
+    """Contact forces of a membrane.
+
+    The rest load makes the rest surface an equilibrium without contact, see `rest_balance`.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        elasticity: what it stores.
-
-    The rest load is what makes the rest surface an equilibrium without contact, see `rest_balance`.
+        elasticity: elastic energy of the membrane.
     """
 
     rest_load: Tensor
@@ -56,12 +62,12 @@ class ContactForce(nn.Module):
         self.register_buffer("free_neighbours", free_neighbours.reshape(6, -1))
 
     def forward(self, u: Tensor, pressure: Tensor) -> Tensor:
-        """The force on every free vertex, `[B, V, 3]`, of the surface displaced by `u [B, V, 3]`, under a pressure `[B]`."""
+        """Return the contact forces `[B, V, 3]`, zero where fixed, of a displacement `u [B, V, 3]` and a pressure `[B]`."""
         of_fluid = pressure[:, None, None] * self.membrane.volume_gradient(self.membrane.rest + u)
         return (self.elasticity.gradient_of_displaced(u) - self.rest_load - of_fluid) * self.free
 
     def linearised(self, u: Tensor, pressure: Tensor) -> Linearised:
-        """The force and what it and the volume do when vertices move, at the inner vertices."""
+        """Return the force and the derivatives of force and volume at the inner vertices."""
         grid, p = self.membrane.grid, pressure[:, None, None]
         edges, chords = (self.rest_edges + apply_stencil(u, self.edges, grid, border=False)).chunk(2, -1)
         edges, volume_ring = edges.unflatten(-1, (6, -1))[:, None], self.membrane.volume_one_ring(chords)
@@ -74,7 +80,7 @@ class ContactForce(nn.Module):
         return Linearised(force * self.inner_free, stiffness, gradient * self.inner_free, normal)
 
     def change(self, stiffness: Tensor, step: Tensor) -> Tensor:
-        """How forces change, `A u [B, C, 3, N]`, for steps `u` of that shape of the inner vertices: `A^T u` as well."""
+        """Return the change `A u` of the forces for steps `u` of the inner vertices, `[B, C, 3, N]` both; `A` is symmetric."""
         m, n = self.membrane.grid
         steps = apply_stencil(step.mT, self.kernels, (m - 2, n - 2))
         steps = steps.unflatten(-1, (len(self.kernels), -1)).flatten(2, 3)

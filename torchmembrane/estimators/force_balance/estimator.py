@@ -1,22 +1,22 @@
-"""Force balance: the surface and the pressure whose residual forces, the contact forces, are few and push inwards.
+"""Force balance: the surface and the pressure whose residual forces, the contact forces, are sparse and compressive.
 
-Every vertex carries three equations of equilibrium and one unknown depth. With the contact traction
+Every vertex has three equations of equilibrium and one unobserved depth. With the contact traction
 
     q_k = (grad_k U(x) - h_k - p grad_k V(x)) / a_k,    s = -q . n / p0 the compressive normal part, q_t the shear,
 
     min over x, p:  sum_d 1/2 R^2 log(1 + |r_d(x)|^2 / (R sigma)^2)
                     + beta sum_k a_k [f(s_k; S_k) + kappa (sqrt(|q_t|^2 / p0^2 + slip^2) - slip) / (1 + c S_k)]
 
-at the cavity's volume. `r_d` is the angle between a marker's ray and its modelled position; its loss (Cauchy) grows ever more
-slowly, so that a wrongly matched marker weighs little. A convex body without friction pushes with at least the fluid's pressure
-or not at all: a small push is the grid's error or noise, a large one a contact. So the loss `f` of a push is quadratic at first
-and saturates beyond `tau` (Geman-McClure), that of a tensile traction stays quadratic, and shear (pseudo-Huber) weighs less
-where something pushes. Whether a vertex is pushed is asked of its surroundings: `S_k` is the rms of `s` over a Gaussian
-neighbourhood of radius `reach` (contacts are patches), and the weights of the steps are taken at `S_k`, smoothed, not at `s_k`.
+subject to the cavity's law. `r_d` is the angle between a marker's ray and its modelled position; its Cauchy loss gives little
+weight to wrongly matched markers. A convex body without friction pushes with at least the fluid's pressure or not at all, so a
+small push (compressive traction) is noise or discretisation error, and a large one a contact. The loss `f` of a push is
+therefore quadratic at first and saturates beyond `tau` (Geman-McClure), that of a tensile traction is quadratic, and shear
+(pseudo-Huber) weighs less under a push. Because contacts are patches, `S_k` is the rms of `s` over a Gaussian neighbourhood of
+radius `reach`, and the weights of the steps are evaluated at `S_k` instead of `s_k`.
 
-Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
-(graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
-its lines, with an `InitialGuess` where something pushes. Frames that have not settled are solved again from several starts.
+The solver is iteratively reweighted least squares (IRLS) with Gauss-Newton steps, while `tau` decreases from where all losses
+are quadratic (graduated non-convexity, GNC), starting from the rest surface. A fine grid starts from the solution on every
+second line, with an `InitialGuess` in the contacts. Frames that have not settled are solved again from several starts.
 """
 
 from dataclasses import replace
@@ -47,34 +47,34 @@ from .traction_loss import TractionLoss, is_significant
 from .uncertainty import depths, gap_around, noise_effects, of_presses, shares_of_deepest, spreads, standard_deviations
 
 MIN_RESOLVED_LINES = 17
-"""Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
+"""Lines of a grid with a discretisation error below the markers' noise; on coarser ones it grows as the square of the step."""
 
 SINGLE_GRID_SETTLING_STEPS = 3
-"""Last steps that are damped to settle, on a grid that none precedes and none follows."""
+"""Number of last steps that are damped to make the solution settle, if there is only one grid."""
 
 
 class ForceBalance(Estimator):
-    """Surface, contact tractions and pressure from marker rays.
+    """Estimates surface, contact tractions and pressure from marker rays.
 
-    A grid with an odd number of lines, at least 11, holds the estimator on every second line as `coarse`. The reference
-    traction `p0` is the rest pressure, or tension / size or (C1 + C2) / size where that is larger.
+    If the grid has an odd number of lines, at least 11, `coarse` is the estimator on every second line. The reference traction
+    `p0` is the largest of the rest pressure, tension / size and (C1 + C2) / size.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        elasticity: its material.
-        markers: the markers as points of it.
-        positions: `[D, 3]`, their rest positions.
-        noise: angular noise of a marker, radians, where an observation does not say; with the grid's own error in it.
-        filling: the cavity, as for `CavityLaw`.
-        gas: a gas' absolute pressure at rest and its volume.
-        settings: everything else.
-        rest: the markers' rays at rest with their noise; None: from the origin, with `noise`.
-        views: how many views see the markers, which are listed once for each.
+        elasticity: elastic energy of the membrane.
+        markers: the markers as points on the membrane.
+        positions: rest positions of the markers, `[D, 3]`.
+        noise: angular noise of a marker including the grid's error, radians, for observations without their own.
+        filling: filling of the cavity, as for `CavityLaw`.
+        gas: absolute pressure and volume of a gas at rest.
+        settings: all other settings.
+        rest: the markers' rays at rest with their noise; None: rays from the origin, with `noise`.
+        views: number of views that see the markers, which are listed once for each view.
         is_coarse: whether a finer grid follows.
-        levers: `[D, 3]`, from the markers to their tips, which are seen, at rest; None: they lie on the surface.
+        levers: vectors from the markers to their visible tips at rest, `[D, 3]`; None: the markers lie on the surface.
 
     Limitations:
-        The press must not be so shallow that its tractions drown in noise; two contacts within `reach` are one.
+        The tractions of the press must exceed those due to noise. Two contacts within `reach` are not resolved.
     """
 
     Settings: ClassVar[type[ForceBalanceSettings]] = ForceBalanceSettings
@@ -122,7 +122,7 @@ class ForceBalance(Estimator):
 
     @classmethod
     def from_problem(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> Self:
-        """The estimator of a sensor."""
+        """Build the estimator for a sensor."""
         rest, noise = rest_rays(problem)
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
         sensor = noise, problem.filling, problem.gas
@@ -140,62 +140,62 @@ class ForceBalance(Estimator):
 
     @property
     def must_compile(self) -> bool:
-        """Whether the first frame waits for machine code to be compiled."""
+        """Whether the first frame has to wait until machine code is compiled."""
         taken = self.membrane.rest.is_cpu and self.equations.bearings.in_machine_code
         return taken and not compiled.is_compiled(self.membrane.rest.numpy().dtype)
 
     @property
     def solves_in_double(self) -> bool:
-        """Whether the sheet is slack, which single precision cannot solve."""
+        """Whether the sheet is too slack to be solved in single precision."""
         return self.equations.is_slack
 
     @property
     def dents(self) -> InitialGuess | None:
-        """Those of this grid or of a coarser one."""
+        """The initial guesses of this grid or of a coarser one."""
         return self.coarse.dents if self.dent is None and self.coarse is not None else self.dent
 
     @property
     def elasticity(self) -> ElasticEnergy:
-        """What the membrane stores."""
+        """Elastic energy of the membrane."""
         return self.equations.forces.elasticity
 
     def set_prestretch(self, prestretch: Tensor) -> None:
-        """Another prestretch `[]`, gradients included; rest pressure and load follow, the reference traction stays."""
+        """Change the prestretch `[]`, which may require gradients, with rest pressure and rest load but not `reference`."""
         self.elasticity.prestretch = prestretch
         self.cavity.rest_pressure, self.equations.forces.rest_load = rest_balance(self.membrane, self.elasticity)
         if self.coarse is not None:
             self.coarse.set_prestretch(prestretch)
 
     def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
-        """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
+        """Return the rays of the markers seen at `pixels [B, D, 2]`, each with its own noise if `covariance` is given."""
         if covariance is None:
             origins, directions = camera.pixel_to_ray(pixels)
             return Observation(origins, directions, confidence)
         return marker_rays(camera, pixels, self.equations.bearings.seen_at_rest, confidence, covariance)
 
     def check_gauge(self) -> None:
-        """Refuse a gauge where it tells nothing."""
+        """Refuse a gauge for an open cavity."""
         refuse_open(self.cavity.filling)
 
     def gauged(self, observation: Observation, pressure: Tensor | float) -> Observation:
-        """The observation with the pressure `[B]` or `[]` that a gauge reads, NaN where there is no reading."""
+        """Add the pressure read by a gauge, `[B]` or `[]`, NaN without a reading, to the observation."""
         self.check_gauge()
         deviation = self.settings.pressure_noise * self.reference
         return observation._replace(gauge=gauge_reading(pressure, self.rest_pressure, deviation, observation.confidence))
 
     def forward(self, observation: Observation) -> Equilibrium:
-        """The surface that the markers' rays show."""
+        """Reconstruct the surface from the markers' rays."""
         measured = self.equations.bearings.measured(observation)
         found = self._solved(measured)
         return Equilibrium(*retry_rows(self.is_done(found, measured), found, self._retry, measured, self.chosen))
 
     def _retry(self, *measured: Any) -> Equilibrium:
-        """In many small steps: deep presses need them."""
+        """Solve again in many small steps, which deep presses need."""
         return self._solved(MeasuredRays(*measured), is_retry=True)
 
     @traced
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
-        """`values` where `done [B]` holds, where the others broke down or are worse than what has converged; else `others`."""
+        """Return `values` where they are `done [B]`, or converged and not clearly worse, or `others` are NaN; else `others`."""
         first, second = Equilibrium(*values), Equilibrium(*others)
         is_worse = second.objective > self.settings.retry_acceptance_ratio * first.objective
         stands = self.is_converged(first) & self.is_explained(first) & is_worse
@@ -206,7 +206,7 @@ class ForceBalance(Estimator):
         return self.equilibrium(*state, before, measured)
 
     def _solve_on_grid(self, measured: MeasuredRays, is_retry: bool) -> tuple[State, Tensor]:
-        """The state after all steps, on coarser grids too, and the surface before the last."""
+        """Return the state after the steps on the coarser grids and this one, and the displacement before the last step."""
         schedule = self.schedule(is_retry)
         last = schedule[-1:] * len(schedule)
         found: tuple[State, Tensor]
@@ -223,17 +223,17 @@ class ForceBalance(Estimator):
         return found
 
     def _begun(self, measured: MeasuredRays, is_retry: bool) -> State:
-        """At what is found on the coarser grid, without one at rest."""
+        """Return the solution of the coarser grid on this one, or the rest state if there is no coarser grid."""
         if self.coarse is None:
             return self.at_rest(measured.weight)
         return State(*self.refined(*self.coarse._solve_on_grid(measured, is_retry)[0]))
 
     def _undented(self, measured: MeasuredRays, is_retry: bool = False) -> State:
-        """The state after a first step, whose pushes say where to dent it."""
+        """Return the state after a first step, whose pushes determine where it is dented."""
         return State(*self.gauss_newton(self._begun(measured, is_retry), measured, self.schedule(is_retry)[:1])[0])
 
     def schedule(self, is_retry: bool = False) -> list[tuple[float, float]]:
-        """`tau` and `R` of every step on this grid; `is_retry`: a second time."""
+        """Return `tau` and `R` of every step on this grid, in a first or second try."""
         settings = self.settings
         steps = settings.retry_steps_factor * self.steps if is_retry else self.steps
         if self.coarse is not None and self.dent is None:
@@ -243,30 +243,30 @@ class ForceBalance(Estimator):
 
     @traced
     def at_rest(self, confidence: Tensor) -> State:
-        """The rest surface and pressure and cameras that have not moved, for every row of `confidence [B, D]`."""
+        """Return the rest state, with cameras that have not moved, for every row of `confidence [B, D]`."""
         frames, pressure = confidence.shape[0], self.rest_pressure
         still = (0 * pressure).repeat(frames, 4 * self.equations.bearings.views)
         return State(torch.zeros_like(self.membrane.rest).repeat(frames, 1, 1), pressure.repeat(frames), still)
 
     @traced
     def coarsened(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
-        """Displacements `[B, V, 3]` of every second line, for `coarse`; pressure `[B]`, as far from rest; camera `[B, 4]`."""
+        """Restrict a state to the grid of `coarse`, with the same change of pressure from rest."""
         return State(u.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure - self._above_coarse(), moved)
 
     @traced
     def refined(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
-        """What `coarse` found on this grid: the displacement is bicubic between its lines, so that it has no folds there."""
-        assert self.refinement is not None  # only called with what the coarser grid has found
+        """Interpolate a state of `coarse` on this grid; the displacement is bicubic, so that it has no kinks at the lines."""
+        assert self.refinement is not None  # only called with a solution of the coarser grid
         return State(self.refinement(u) * self.equations.forces.free, pressure + self._above_coarse(), moved)
 
     def _above_coarse(self) -> Tensor:
-        """By how much the rest pressure is above that of `coarse`, `[]`: every grid has its own."""
+        """Return the rest pressure minus that of `coarse`, `[]`; every grid has its own."""
         assert self.coarse is not None
         return self.rest_pressure - self.coarse.rest_pressure
 
     @traced
     def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: MeasuredRays) -> Equilibrium:
-        """What this state amounts to; `before`: the displacement a step earlier."""
+        """Return the solution of a state; `before` is the displacement one step earlier."""
         membrane, steps, x = self.membrane, self.gauss_newton, self.membrane.rest + u
         if steps.is_native(u, pressure, moved, before, *measured):
             given = self.equations, self.cavity, (u, pressure, moved), before, measured, self._far
@@ -286,18 +286,18 @@ class ForceBalance(Estimator):
 
     @traced
     def is_converged(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: the last step was short and the volume is what the cavity's law asks for."""
+        """Return where the last step was short and the volume fulfils the cavity's law, `[B]` bool."""
         error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
         return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
 
     @traced
     def is_settled(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: converged and explained, so that more steps would change little."""
+        """Return where the solution is converged and explained, so that more steps would change little, `[B]` bool."""
         return (found.relative_step < self.settings.settled_step_tol) & self.is_converged(found) & self.is_explained(found)
 
     @traced
     def is_done(self, found: Equilibrium, measured: MeasuredRays) -> Tensor:
-        """`[B]` bool: settled, plausible, not a mound in place of a dent, and with few outliers among the markers."""
+        """Return where the solution is settled, plausible, not a mound in place of a dent, and has few outliers, `[B]` bool."""
         settings, (least, most, untouched) = self.settings, self.settings.likely_objective
         outlying = self.equations.bearings.outlying(found.vertices - self.membrane.rest, measured, found.moved, self._far)
         likely = (least + settings.likely_per_displacement * self._press(found)).clamp_max(most)
@@ -307,8 +307,8 @@ class ForceBalance(Estimator):
         return done if self.dents is None else done & ~self.dents.is_ring_shaped(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: noise and the model's error explain the markers' angles off their rays, neighbours are not off alike,
-        there is hardly any tension or shear without a push, little of both together, and not all of the surface is pushed."""
+        """Return where a surface of this sensor explains the markers, `[B]` bool: misfit, misfit shared by neighbours, tension
+        and shear without a push, the sum of the latter two, and the share of the surface in contact are below their limits."""
         settings, press = self.settings, self._press(found)
         misfit = found.misfit / (settings.largest_misfit + settings.misfit_per_displacement * press) / self.coarseness
         largest = settings.largest_unexplained + settings.unexplained_per_displacement * press
@@ -318,15 +318,15 @@ class ForceBalance(Estimator):
         return torch.logical_not(doubtful | (found.pushed > settings.largest_pushed))
 
     def _press(self, found: Equilibrium) -> Tensor:
-        """Rms displacement over the size, `[B]`."""
+        """Return the rms displacement relative to the size, `[B]`."""
         return torch.sqrt((found.vertices - self.membrane.rest).square().sum(-1).mean(-1) / self.size**2)
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
-        """Where something pushes."""
+        """Return the contacts: patches of compressive traction."""
         return self.patches.pushes(found.vertices, normals, found.traction, found.reference, self.equations.loss.surroundings)
 
     def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
-        """How far off force and depth may be; spread on the grid of `coarse`, which costs little and knows as much."""
+        """Return the standard deviations of force and depth, computed on the grid of `coarse`: cheaper, and as accurate."""
         u, whole = found.vertices - self.membrane.rest, (found.pressure, found.moved)
         net, state = (self, State(u, *whole)) if self.coarse is None else (self.coarse, self.coarsened(u, *whole))
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, u)
@@ -339,11 +339,11 @@ class ForceBalance(Estimator):
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor
     ) -> StandardDeviations:
-        """Of a solution's surface, total force and pressure, as the noise of the markers spreads to first order.
+        """Return the standard deviations of a solution's surface, total force and pressure due to the markers' noise.
 
         Limitations:
-            Noise must not change which vertices are pushed, as it does in the shallowest presses and where two answers
-            compete; the grid's and the material's errors are not in it.
+            They are first order: noise must not change which vertices are pushed, as it does in the shallowest presses and
+            where two solutions compete. Errors of the grid and of the material are not included.
         """
         x, pressure, moved = (value.to(self.membrane.rest.dtype) for value in (x, pressure, moved))
         state = State(x - self.membrane.rest, pressure, moved)

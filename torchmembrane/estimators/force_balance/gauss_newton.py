@@ -1,4 +1,4 @@
-"""Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
+"""Gauss-Newton steps of force balance in surface, pressure and camera motion, with linearised volume."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -23,13 +23,18 @@ from .settings import ForceBalanceSettings
 from .traction_loss import LossTerms
 
 VERTICES = 9000
-"""Of a batch's surfaces that are worked on at a time, but for a frame for every thread that takes steps by machine code: what a
-step makes of more does not stay in a processor's cache."""
+"""Number of vertices of a batch that are processed at a time, so that the data of a step stay in the processor's cache; machine
+code processes at least one frame per thread."""
 
 
 class State(NamedTuple):
-    """What the steps change: the surface's displacement `u [B, V, 3]` from rest (positions in float32 would round the strain
-    of a slack sheet), the `pressure [B]`, and by how much the W views' cameras have `moved [B, 4 W]`."""
+    """The unknowns of the steps.
+
+    Attributes:
+        u: displacement of the surface from rest, `[B, V, 3]`; positions in float32 would lose the strain of a slack sheet.
+        pressure: pressure difference across the membrane, `[B]`.
+        moved: motion of the cameras of the W views, `[B, 4 W]`.
+    """
 
     u: Tensor
     pressure: Tensor
@@ -37,8 +42,15 @@ class State(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """Numbers of a step, `[]` each: the scales `tau` of the compressive traction's loss and `outlier` of the markers'; `cone`
-    as for `TractionLoss.weights`, `renewal` as of its memory; `damping`, the share of the matrix' diagonal that is added."""
+    """Parameters of a step, `[]` each.
+
+    Attributes:
+        tau: scale of the loss of compressive traction.
+        outlier: scale of the markers' loss.
+        cone: as for `TractionLoss.weights`.
+        renewal: as in the memory of `TractionLoss.weights`.
+        damping: relative increase of the matrix's diagonal.
+    """
 
     tau: Tensor
     outlier: Tensor
@@ -48,11 +60,11 @@ class Scales(NamedTuple):
 
 
 class GaussNewton(nn.Module):
-    """Reweighted Gauss-Newton steps by a schedule of the losses' scales.
+    """Iteratively reweighted Gauss-Newton steps with a schedule of the losses' scales.
 
     Args:
-        equations: equations of the force balance, linearised and weighted.
-        cavity: its law.
+        equations: linearised and weighted equations of force balance.
+        cavity: law of the cavity's filling.
         settings: settings of the estimator.
     """
 
@@ -72,15 +84,15 @@ class GaussNewton(nn.Module):
         settling: int = 1,
         damping: float | None = None,
     ) -> tuple[State, Tensor]:
-        """The state after the steps of a schedule, and the displacement before the last step.
+        """Return the state after the steps of a schedule, and the displacement before the last step.
 
         Args:
-            state: to start from.
+            state: initial state.
             measured: the markers' rays.
             schedule: scales of the losses in every step.
             cone: as for `TractionLoss.weights`.
-            settling: number of last steps that have at least this damping, so that they settle.
-            damping: default `settling_damping`.
+            settling: number of last steps with at least `damping`, so that the solution settles.
+            damping: damping of these steps; default `settling_damping`.
         """
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         if self.is_native(*state, *measured):
@@ -94,8 +106,14 @@ class GaussNewton(nn.Module):
         return State(u, pressure, moved), before
 
     def _numbers(self, taus: list[float], least: float) -> tuple[float, float]:
-        """The renewal and the damping of a step, from the scales `tau` up to its own; `least`: smallest damping, except in a
-        first step. While the scales decline, all weights are new, because they would lag behind otherwise."""
+        """Return the renewal and the damping of a step.
+
+        While the scales decrease, the weights of the step before are not used, because the weights would lag behind.
+
+        Args:
+            taus: scales `tau` of all steps up to this one.
+            least: smallest damping, except in the first step.
+        """
         settings, (first, last) = self.settings, self.settings.tau
         *before, tau = taus
         damping = settings.damping * (min(tau, first) / last) ** 2
@@ -104,8 +122,8 @@ class GaussNewton(nn.Module):
         return settings.renewal if before[-1:] == [tau] else 1.0, damping
 
     def _run_chunk(self, u: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The state after the steps, and the displacement before the last; `given`: what is measured, the steps' scales, how
-        many of them settle."""
+        """Return the state after the steps, and the displacement before the last; `given` are the rays, the parameters of the
+        steps, and the number of settling steps."""
         *of_markers, rows, settling = given
         measured, last = MeasuredRays(*of_markers), rows[-settling:] if settling > 1 else []
         state: Sequence[Any] = (u, pressure, moved, u, self._unweighted(u))
@@ -120,45 +138,45 @@ class GaussNewton(nn.Module):
         return u, pressure, moved, before
 
     def is_native(self, *values: Any) -> bool:
-        """Whether steps of these tensors are taken by machine code."""
+        """Return whether machine code takes the steps of these tensors."""
         return self.equations.bearings.in_machine_code and takes(*values, self.equations.forces.elasticity.prestretch)
 
     @traced
     def _unweighted(self, u: Tensor) -> Tensor:
-        """What stands in for the weights of a step before the first, `[B, N]`; the first step does not use it."""
+        """Return a placeholder for the weights of a step before the first, `[B, N]`; the first step does not use it."""
         return torch.ones_like(u[:, : self.equations.loss.area.shape[0], 0])
 
     @traced
     def _none_found(self, pressure: Tensor) -> Tensor:
-        """The objective of no state, `[B]`."""
+        """Return the objective of a state that does not exist yet: infinity, `[B]`."""
         return torch.full_like(pressure, torch.inf)
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: MeasuredRays) -> Tensor:
-        """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
+        """Return the objective of the last steps, `[B]`: the misfit of markers and gauge, and the loss of the tractions."""
         terms: LossTerms = self.equations.loss(traction, normal, measured.noise_level)
         angles = self.equations.bearings.angles(state.u, measured, state.moved)[0]
         return self.misfit(angles, state.pressure, measured) + terms.others + terms.pushes
 
     def objective_at_rest(self, measured: MeasuredRays) -> Tensor:
-        """The same of the surface at rest and a camera that has not moved; there are no tractions."""
+        """Return the objective at rest, without camera motion and tractions, `[B]`."""
         still, none = torch.zeros_like(self.membrane.rest[None]), torch.zeros_like(measured.noise_level)
         angles = self.equations.bearings.angles(still, measured, none[:, None].expand(-1, measured.motion.shape[2]))[0]
         return self.misfit(angles, none + self.cavity.rest_pressure, measured)
 
     def misfit(self, angles: Tensor, pressure: Tensor, measured: MeasuredRays) -> Tensor:
-        """The part `[B]` of markers, seen at `angles [B, 2, D]`, and of a gauge."""
+        """Return the part of the objective from markers with `angles [B, 2, D]`, and from a gauge, `[B]`."""
         misfit = measured.weight * angles.square().sum(1)
         of_markers: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1)
         return of_markers + gauge_loss(measured.gauge, pressure - self.cavity.rest_pressure)
 
     def tractions(self, u: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """The contact tractions of the inner vertices and their outward normals, `[B, 3, N]` each."""
+        """Return contact tractions and outward normals at the inner vertices, `[B, 3, N]` each."""
         traction = self.equations.forces(u, pressure) / self.membrane.rest_area[:, None]
         normals = self.membrane.normals(self.membrane.rest + u)
         return inner(traction, self.membrane.grid).mT, inner(normals, self.membrane.grid).mT
 
     def traction(self, state: State, measured: MeasuredRays) -> Tensor:
-        """The contact tractions `[B, V, 3]`."""
+        """Return the contact tractions `[B, V, 3]`."""
         if self.is_native(*state, *measured):
             return self.native.solution(*self._given, state, state.u, measured, 1.0)[1]
         traction: Tensor = self.equations.forces(state.u, state.pressure) / self.membrane.rest_area[:, None]
@@ -175,7 +193,7 @@ class GaussNewton(nn.Module):
         measured: MeasuredRays,
         *scales: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The state, the displacement before, and the weights of normal tractions."""
+        """Take a step; return the state, the displacement before it, and the weights of normal tractions."""
         state, weights = self._compiled_step(State(u, pressure, moved), weights, measured, scales)
         return *state, u, weights
 
@@ -183,11 +201,17 @@ class GaussNewton(nn.Module):
     def _step_keeping_best(
         self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any
     ) -> list[Tensor]:
-        """What `_next` returns, and of the states so far the one of the lowest objective, the displacement before it and its
-        objective: where a vertex is pushed in one step and pulled in the next, not every step is an answer.
+        """Take a step, and keep the state with the lowest objective, with the displacement before it and its objective.
+
+        If a vertex is alternately pushed and pulled, not every step gives a usable solution.
 
         Args:
-            given: the best state so far, what is measured, and the numbers of the step.
+            u: current displacement, `[B, V, 3]`.
+            pressure: current pressure, `[B]`.
+            moved: current camera motion, `[B, 4 W]`.
+            before: displacement before the last step, `[B, V, 3]`.
+            weights: weights of normal tractions, `[B, N]`.
+            given: the best state so far, the measured rays, and the parameters of the step.
         """
         *kept, lowest, measured = given[:6]
         state, weights = self._compiled_step(State(u, pressure, moved), weights, measured, given[6:])
@@ -198,9 +222,9 @@ class GaussNewton(nn.Module):
     def _compiled_step(
         self, state: State, weights: Tensor, measured: MeasuredRays, scales: Sequence[float]
     ) -> tuple[State, Tensor]:
-        """`step`, which `torch.compile` traces and compiles once instead of once per step, as the exporter does by itself.
+        """Take `step` as a region that `torch.compile` traces and compiles only once; the exporter does the same by itself.
 
-        With gradients every step is traced: the gradients of a nested region have strides that torch 2.13 does not follow.
+        With gradients every step is traced: the gradients of a nested region have strides that torch 2.13 does not handle.
         """
         if self.is_native(*state, weights, *measured):
             *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
@@ -215,16 +239,16 @@ class GaussNewton(nn.Module):
         return self.step(state, weights, measured, scales)
 
     def step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
-        """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
+        """Take one reweighted Gauss-Newton step with linearised volume, limiting the longest step of a vertex.
 
         Args:
-            state: before the step.
+            state: state before the step.
             weights: weights of the normal tractions in the step before, `[B, N]`.
             measured: the markers' rays.
-            scales: scales of the losses, and the step's other numbers.
+            scales: scales of the losses, and the step's other parameters.
 
         Returns:
-            The state and the weights after it.
+            The state and the weights after the step.
         """
         tau, outlier, cone, renewal, damping = scales
         equations, (u, pressure, moved) = self.equations, state
@@ -233,7 +257,7 @@ class GaussNewton(nn.Module):
         )
         loads = torch.cat([loads, motion.coupling], 1)
         first, last = self.settings.tau
-        blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
+        blunt = (tau.clamp_max(first) / last) ** 2  # 1 at the last tau
         solved = self._solved(normal, loads, damping)
         motion = motion.with_prior(moved, self.settings.camera_motion * blunt)
         products, following = motion.eliminated(loads @ solved.mT)
@@ -246,7 +270,7 @@ class GaussNewton(nn.Module):
         return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
 
     def _solved(self, normal: NormalEquations, loads: Tensor, damping: Tensor) -> Tensor:
-        """The solutions `[B, C, 3 N]` of the equations, damped; gradients take what was solved, not how."""
+        """Return the solutions `[B, C, 3 N]` of the damped equations; gradients are those of the exact solution."""
         equations = self.equations
         if torch.compiler.is_compiling():
             return equations.system.substitute(equations.system.factor(equations.matrix(normal, damping)), loads)
@@ -255,8 +279,8 @@ class GaussNewton(nn.Module):
         return differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
 
     def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
-        """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the
-        second is 1, the third what the pressure rises by."""
+        """Return the coefficients `[B, 3]` of the three loads' solutions in the negative step: the multiplier of the volume
+        constraint, 1, and the increase of the pressure."""
         one = torch.ones_like(pressure)
         if self.cavity.filling == "open":
             return torch.stack([0 * one, one, 0 * one], 1)
@@ -267,7 +291,8 @@ class GaussNewton(nn.Module):
         return torch.stack([multiplier, one, rise], 1)
 
     def _share(self, u: Tensor, move: Tensor) -> Tensor:
-        """Of a step `move [B, 3, m, n]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+        """Return the factor `[B]` that scales a step `move [B, 3, m, n]`, to limit the motion of vertices and the stretch of
+        the grid's edges."""
         settings, tiny = self.settings, torch.finfo(u.dtype).tiny
         both = torch.stack([move, (self.membrane.rest + u).mT.unflatten(-1, self.membrane.grid)], 1)
         far2 = move.square().sum(1).flatten(1).amax(-1) / (settings.longest_step * self.membrane.size) ** 2

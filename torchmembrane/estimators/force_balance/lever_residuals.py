@@ -1,14 +1,14 @@
-"""Residuals of markers that stand off the surface: the angles of their tips, which turn with the surface under them.
+"""Residuals of markers at a distance from the surface: the angles of their tips, which turn with the surface under them.
 
-A tip `x + h n` follows three fields of the surface's displacement: the displacement itself and its derivatives along the grid's
-two directions, which turn the tangents. With the dual basis `a*, b*` of these and the Jacobian `J` of the angles in a place
+A tip `x + h n` depends on three fields: the displacement of the surface, and its derivatives along the grid's two directions,
+which turn the tangents. With the dual basis `a*, b*` of the tangents and the Jacobian `J` of the angles in the tip's position
 
     dr = J dx - h (J a*) (n . da) - h (J b*) (n . db),
 
-so each marker has three Jacobians, `J`, `-h (J a*) n^T` and `-h (J b*) n^T`, one after the other on an axis of `3 D`. In the
-residuals both derivatives are of the bicubic displacement. In the equations they are of the quadratic that the seven vertices
-around the nearest one determine: of these, no two are farther apart than two vertices of a force's stencil, so that the matrix
-stays as sparse as it is without levers.
+so each marker has three Jacobians, `J`, `-h (J a*) n^T` and `-h (J b*) n^T`, concatenated on an axis of length `3 D`. The
+residuals use the derivatives of the bicubic displacement. The equations use those of the quadratic through the stencil of seven
+vertices around the nearest one. No two of them are farther apart than the vertices of a force's stencil, so the matrix is as
+sparse as without levers.
 """
 
 import numpy as np
@@ -27,27 +27,28 @@ from ..base import Observation
 from .marker_residuals import MarkerResiduals, MeasuredRays
 
 FIELDS = 3
-"""Number of fields that a tip follows: displacement, and its two derivatives."""
+"""Number of fields that a tip depends on: the displacement and its two derivatives."""
 QUADRATIC = 0.5 * np.array(
     [
         [[0, 1, 0, 0, -1, 0, 0], [-4, 2, 0, 0, 2, 0, 0], [2, -1, 1, -1, -1, 1, -1]],
         [[0, 0, 0, 1, 0, 0, -1], [2, -1, 1, -1, -1, 1, -1], [-4, 0, 0, 2, 0, 0, 2]],
     ]
 )
-"""`[2, 3, 7]`: from a field at the vertices of `STENCIL` its two derivatives, and theirs in both directions."""
+"""Weights `[2, 3, 7]` of a field at the vertices of `STENCIL`. First axis: its derivative along each grid direction. Second
+axis: the value of this derivative at the centre, and its own two derivatives."""
 
 
 class LeverResiduals(MarkerResiduals):
-    """The tips of markers that stand off a surface, and how they are seen off their measured rays.
+    """Angles between the tips of markers and their measured rays, with their derivatives.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        markers: the markers' feet as points of it.
-        positions: `[D, 3]` their rest positions.
-        noise: as of `MarkerResiduals`.
-        rest: the tips' rays at rest; None: from the origin, with that noise.
-        views: as of `MarkerResiduals`.
-        levers: `[D, 3]`, from feet to tips at rest.
+        markers: the markers' feet as points on the rest surface.
+        positions: rest positions of the feet, `[D, 3]`.
+        noise: as for `MarkerResiduals`.
+        rest: the tips' rays at rest; None: rays from the origin, with `noise`.
+        views: as for `MarkerResiduals`.
+        levers: vectors from feet to tips at rest, `[D, 3]`.
     """
 
     tips_at_rest: Tensor
@@ -82,16 +83,16 @@ class LeverResiduals(MarkerResiduals):
 
     @property
     def in_machine_code(self) -> bool:
-        """No step is."""
+        """Whether machine code can take the steps: never."""
         return False
 
     @property
     def seen_at_rest(self) -> Tensor:
-        """The tips at rest, `[D, 3]`."""
+        """Positions of the tips at rest, `[D, 3]`."""
         return self.tips_at_rest
 
     def angles(self, u: Tensor, measured: MeasuredRays, moved: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles of the tips across the measured rays, `[B, 2, D]`, and their Jacobians `[B, 2, 3, 3 D]`."""
+        """Return the angles between tips and measured rays, `[B, 2, D]`, and their Jacobians `[B, 2, 3, 3 D]`."""
         levers, normal, dual = self.levers(u)
         angle, jacobian = self._seen(self.markers(u) + levers, measured, moved)
         lengths = -self.levers.heights * (jacobian[:, :, None] * dual.mT[:, None]).sum(3)  # [B, 2, 2, D]
@@ -99,16 +100,16 @@ class LeverResiduals(MarkerResiduals):
         return angle, torch.cat([jacobian, *of_slopes.unbind(2)], -1)
 
     def repeated(self, values: Tensor) -> Tensor:
-        """Values `[..., D]` of the markers for each of the three fields, `[..., 3 D]`."""
+        """Repeat values `[..., D]` of the markers for each of the three fields, `[..., 3 D]`."""
         return torch.cat([values] * FIELDS, -1)
 
     def joined(self, values: Tensor) -> Tensor:
-        """The sum `[..., D]` over the three fields."""
+        """Sum values over the three fields, `[..., D]`."""
         joined: Tensor = values.unflatten(-1, (FIELDS, -1)).sum(-2)
         return joined
 
     def blocks(self, jacobian: Tensor, weighted: Tensor) -> Tensor:
-        """The markers' blocks `[B, 3, 3, 28 D]` between the pairs of the seven vertices around each."""
+        """Return the markers' blocks `[B, 3, 3, 28 D]` for the 28 pairs of the seven vertices around each."""
         here, there = (
             (each.unflatten(-1, (FIELDS, -1))[..., None] * self.ring_shares).sum(3).index_select(4, slots)
             for each, slots in ((jacobian, self.first), (weighted, self.second))
@@ -117,18 +118,18 @@ class LeverResiduals(MarkerResiduals):
         return blocks
 
     def near(self, blocks: Tensor) -> Tensor:
-        """As of `MarkerResiduals`, at all `OFFSETS`."""
+        """Return the blocks between the inner vertices and their neighbours at all `OFFSETS`, `[B, 3, 3, 10, N]`."""
         zero = torch.zeros_like(blocks[..., :1])
         each = torch.cat([blocks, zero], -1).index_select(3, self.sources.flatten())
         near: Tensor = each.unflatten(3, self.sources.shape).sum(-1).unflatten(3, (len(OFFSETS), -1))
         return near
 
     def diagonal(self, blocks: Tensor) -> Tensor:
-        """As of `MarkerResiduals`."""
+        """Return the diagonal of `J^T w J` at the inner vertices, `[B, 3, N]`."""
         return self.near(blocks)[:, :, :, 0].diagonal(dim1=1, dim2=2).mT
 
     def product(self, blocks: Tensor, u: Tensor) -> Tensor:
-        """As of `MarkerResiduals`: by the blocks at the `OFFSETS`, and by their transposes the other way."""
+        """Return the products of `J^T w J` with fields `u [B, C, 3, N]`, from the blocks at `OFFSETS` and their transposes."""
         grid = self.grid[0] - 2, self.grid[1] - 2
         near, field, parts = self.near(blocks).unflatten(-1, grid), u.unflatten(-1, grid), []
         for k, (i, j) in enumerate(OFFSETS):
@@ -140,7 +141,7 @@ class LeverResiduals(MarkerResiduals):
         return torch.stack(parts).sum(0).flatten(-2)
 
     def loads_alone(self, turned: Tensor, weighted: Tensor) -> Tensor:
-        """As of `MarkerResiduals`."""
+        """Return the loads `J^T w e [B, D, 2, 3, N]` of every single marker, as `MarkerResiduals.loads_alone` does."""
         weighted, shares = (each.unflatten(axis, (FIELDS, -1)) for each, axis in ((weighted, -1), (self.vertex_shares, 0)))
         return torch.einsum("bdra,bacpd,pdn->bdrcn", turned, weighted, shares)
 
@@ -154,14 +155,19 @@ def residuals_of(
     views: int,
     levers: Tensor | None,
 ) -> MarkerResiduals:
-    """The residuals of markers on a surface, or of tips where there are `levers`; arguments as of `LeverResiduals`."""
+    """Return the residuals of markers on a surface, or of tips if `levers` are given; arguments as for `LeverResiduals`."""
     given = membrane, markers, positions, noise, rest, views
     return MarkerResiduals(*given) if levers is None else LeverResiduals(*given, levers)
 
 
 def _ring_shares(membrane: Membrane, markers: SurfacePoints) -> tuple[np.ndarray, np.ndarray]:
-    """The inner vertices `[D, 7]` of the stencil around the one nearest to each marker, -1 beside them, and their shares in the
-    three fields, `[3, D, 7]`; where one of them is fixed a field may have a kink, and is linear in the marker's triangle."""
+    """Return the vertices of the stencil around the inner vertex nearest to each marker, and their weights in the three fields.
+
+    If an inner vertex of the stencil is fixed, a field may have a kink there, so it is linear in the marker's triangle.
+
+    Returns:
+        Indices of the inner vertices, -1 for others, `[D, 7]`, and weights `[3, D, 7]`.
+    """
     m, n = membrane.grid
     corners = np.stack(np.divmod(markers.vertices, n), -1)
     is_inner = ((corners > 0) & (corners < [m - 1, n - 1])).all(-1)
@@ -180,8 +186,10 @@ def _ring_shares(membrane: Membrane, markers: SurfacePoints) -> tuple[np.ndarray
 
 
 def _sources(vertices: np.ndarray, count: int) -> np.ndarray:
-    """Of the blocks between `count` vertices and those at the `OFFSETS`, the pairs `[10 N, K]` among the `28 D` of the markers'
-    `vertices [D, 7]` that add to each, then `28 D`, which stands for none."""
+    """Return, for the block between each of `count` vertices and its neighbour at each of `OFFSETS`, the contributing pairs.
+
+    They are indices `[10 N, K]` of the `28 D` vertex pairs of the markers' stencils `vertices [D, 7]`, padded with `28 D`.
+    """
     pairs = np.array(PAIRS)
     offsets = [OFFSETS.index((STENCIL[b][0] - STENCIL[a][0], STENCIL[b][1] - STENCIL[a][1])) for a, b in PAIRS]
     here, there = (vertices[:, slots].ravel() for slots in pairs.T)
@@ -196,12 +204,12 @@ def _sources(vertices: np.ndarray, count: int) -> np.ndarray:
 
 
 def _overlap(i: int, j: int, m: int, n: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Rows and columns of a grid's vertices that have one at the offset `i, j` from them, and of these."""
+    """Return rows and columns of the vertices that have a neighbour at the offset `i, j`, and those of the neighbours."""
     here = slice(max(0, -i), m - max(0, i)), slice(max(0, -j), n - max(0, j))
     return here, (slice(here[0].start + i, here[0].stop + i), slice(here[1].start + j, here[1].stop + j))
 
 
 def _placed(part: Tensor, at: tuple[slice, slice], grid: tuple[int, int]) -> Tensor:
-    """Fields of a grid that are zero but `at` some of its rows and columns."""
+    """Pad a part of a grid's field, `at` some rows and columns, with zeros to the whole grid."""
     rows, columns = at
     return F.pad(part, (columns.start, grid[1] - columns.stop, rows.start, grid[0] - rows.stop))

@@ -1,4 +1,4 @@
-"""Residuals of the markers: the angles between the markers' measured rays and where the surface has the markers."""
+"""Residuals of the markers: the angles between their measured rays and their positions on the surface."""
 
 from typing import NamedTuple
 
@@ -19,18 +19,18 @@ from ...surface.tangent import tangent_frame
 from ..base import Observation, Problem
 
 NEIGHBOURS = 4
-"""Number of neighbours of a marker that are tested for being off their rays in the same way."""
+"""Number of a marker's neighbours whose deviations from their rays are compared with its own."""
 
 
 class MeasuredRays(NamedTuple):
-    """Measured marker rays, and what a gauge reads.
+    """Measured marker rays, and the reading of a gauge.
 
-    origins      `[B, 3, D]`
-    across       `[B, 2, 3, D]`, two vectors across each ray, along which its turns are measured in standard deviations
-    weight       `[B, D]`, the markers' confidence
-    noise_level  `[B]`, the markers' standard deviations over their own at rest, their geometric mean
-    motion       `[B, 2, 4 W, D]`, derivatives of the angles in the motion of each view's image: du, dv, rotation, growth (px)
-    gauge        `[B, 2]`, as of `Observation`, or None
+    origins      `[B, 3, D]`, origins of the rays
+    across       `[B, 2, 3, D]`, two vectors orthogonal to each ray, along which angles are in standard deviations
+    weight       `[B, D]`, confidence of the markers
+    noise_level  `[B]`, geometric mean of the markers' standard deviations relative to those at rest
+    motion       `[B, 2, 4 W, D]`, derivatives of the angles in the motion of each view's image: du, dv, rotation, scaling (px)
+    gauge        `[B, 2]`, as for `Observation`, or None
     """
 
     origins: Tensor
@@ -42,20 +42,21 @@ class MeasuredRays(NamedTuple):
 
 
 def marker_rays(camera: Camera | Rig, pixels: Tensor, positions: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
-    """The rays of markers, each with its own noise.
+    """Return the rays of markers, each with its own noise.
 
     Args:
-        camera: the sensor's.
-        pixels: `[B, D, 2]`.
-        positions: `[D, 3]`, the markers' rest positions: behind a port a ray's origin moves too, which turns it about a marker.
-        confidence: `[B, D]`.
+        camera: camera of the sensor.
+        pixels: pixels of the markers, `[B, D, 2]`.
+        positions: rest positions of the markers, `[D, 3]`; behind a port the origin of a ray moves with the pixel, which also
+            changes the angle at the marker.
+        confidence: confidence of the markers, `[B, D]`.
         covariance: covariance of the pixels, `[B, D, 2, 2]` px^2.
 
     Returns:
-        The rays; along `across` a turn has the covariance 1: with the derivative `J [3, 2]` of a ray in its pixel, as a marker
-        sees it, and the covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`. `motion`: what the image's motion
-        against the rim, `p -> p + (du, dv) + (rotation x (p - c) + growth (p - c)) / R` about the image's centre `c`, makes of
-        them; all four in px, those of rotation and growth at half the image's diagonal, `R`.
+        The rays. Angles along `across` have unit covariance: with the derivative `J [3, 2]` of a ray's direction, seen from its
+        marker, in the pixel, and the covariance `C = L L^T`, its vectors are the rows of `L^-1 (J^T J)^-1 J^T`. `motion` has
+        the derivatives of these angles in the motion of the image relative to the rim, `p -> p + (du, dv) + (rotation x (p - c)
+        + growth (p - c)) / R` about the image's centre `c`. All four are in px; `R` is half the image's diagonal.
     """
     half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
     steps = torch.cat([torch.zeros_like(half[:1]), half, -half])[:, None]
@@ -66,7 +67,7 @@ def marker_rays(camera: Camera | Rig, pixels: Tensor, positions: Tensor, confide
     by_u, by_v = (turns - (turns * direction).sum(-1, keepdim=True) * direction).unbind(1)
     uu, uv, vv = ((a * b).sum(-1, keepdim=True) for a, b in ((by_u, by_u), (by_u, by_v), (by_v, by_v)))
     area2 = uu * vv - uv * uv
-    in_u, in_v = (vv * by_u - uv * by_v) / area2, (uu * by_v - uv * by_u) / area2  # px of a small turn
+    in_u, in_v = (vv * by_u - uv * by_v) / area2, (uu * by_v - uv * by_u) / area2  # from small rotations to px
     a, b, c = (covariance[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     first = in_u * a.rsqrt()
     second = (in_v - b / a * in_u) * (c - b * b / a).rsqrt()
@@ -77,7 +78,7 @@ def marker_rays(camera: Camera | Rig, pixels: Tensor, positions: Tensor, confide
 
 
 def rest_rays(problem: Problem) -> tuple[Observation, float]:
-    """The rays of a sensor's markers at rest, and their noise in the mean, radians."""
+    """Return the rays of a sensor's markers at rest, and their mean noise, radians."""
     noise = float(problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean().sqrt() / problem.camera.focal.mean())
     counts, seen = problem.rest_confidence, problem.positions
     sure = torch.ones_like(problem.rest_pixels[None, :, 0]) if counts is None else counts[None]
@@ -86,27 +87,27 @@ def rest_rays(problem: Problem) -> tuple[Observation, float]:
 
 
 def seen_from_origin(positions: Tensor) -> Observation:
-    """Markers at `positions [D, 3]` as a camera without ports sees them."""
+    """Return the rays from the origin to markers at `positions [D, 3]`, as for a camera without ports."""
     directions = F.normalize(positions, dim=-1)[None]
     return Observation(torch.zeros_like(directions), directions, torch.ones_like(directions[..., 0]))
 
 
 def _spread(across: Tensor) -> Tensor:
-    """Variance of the turns `[...]` in the geometric mean of both directions, of vectors `[..., 2, 3]` across rays."""
+    """Return the angular variance `[...]`, the geometric mean of both directions, from the vectors `across [..., 2, 3]`."""
     area: Tensor = torch.linalg.vector_norm(torch.linalg.cross(across[..., 0, :], across[..., 1, :]), dim=-1)
     return 1 / area
 
 
 class MarkerResiduals(nn.Module):
-    """The markers of a surface, and how they are seen off their measured rays.
+    """Angles between the markers of a surface and their measured rays, with their derivatives.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        markers: the markers as points of it.
-        positions: `[D, 3]` their rest positions.
-        noise: standard deviation of a marker's angles, radians, where an observation does not give it.
-        rest: the markers' rays at rest; None: from the origin, with that noise.
-        views: how many views see the markers, which are listed once for each.
+        markers: the markers as points on the rest surface.
+        positions: rest positions of the markers, `[D, 3]`.
+        noise: standard deviation of a marker's angles, radians, for observations without their own.
+        rest: the markers' rays at rest; None: rays from the origin, with `noise`.
+        views: number of views that see the markers, which are listed once for each view.
     """
 
     positions: Tensor
@@ -142,17 +143,17 @@ class MarkerResiduals(nn.Module):
 
     @property
     def in_machine_code(self) -> bool:
-        """Whether the steps of one view's markers that lie on the surface can be taken by machine code."""
+        """Whether machine code can take the steps: for one view and markers on the surface."""
         return self.views == 1
 
     @property
     def seen_at_rest(self) -> Tensor:
-        """What the camera sees of the markers at rest, `[D, 3]`."""
+        """The visible points of the markers at rest, `[D, 3]`."""
         return self.positions
 
     @traced
     def measured(self, observation: Observation) -> MeasuredRays:
-        """The markers' rays as `angles` takes them."""
+        """Return the markers' rays in the form that `angles` needs."""
         origins, directions, confidence, across, motion, gauge = observation.to(self.positions.dtype)
         if across is None:
             across = tangent_frame(directions) / self.noise
@@ -165,18 +166,28 @@ class MarkerResiduals(nn.Module):
         return MeasuredRays(origins.mT.contiguous(), *turned, gauge)
 
     def markers(self, u: Tensor) -> Tensor:
-        """The markers' positions on the surface displaced by `u [B, V, 3]`, `[B, D, 3]`: their displacement is bicubic between
-        the grid's lines. In the equations it is linear, for their sparsity: steps are short, and smooth as the chords' errors
-        are not."""
+        """Return the markers' positions `[B, D, 3]` on the surface displaced by `u [B, V, 3]`, by bicubic interpolation.
+
+        The equations use linear interpolation, so that they are sparse. This is accurate enough for steps, which are short and
+        smoother than the displacement itself.
+        """
         return self.positions + self.smooth_shares @ inner(u, self.grid)
 
     def angles(self, u: Tensor, measured: MeasuredRays, moved: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles across the measured rays `[B, 2, D]`, and the bearing Jacobian: their derivatives in the markers' positions,
-        `[B, 2, 3, D]`; `moved [B, 4 W]`: of the views' cameras."""
+        """Return the angles between markers and measured rays, `[B, 2, D]`, and the bearing Jacobian.
+
+        Args:
+            u: displacement of the vertices, `[B, V, 3]`.
+            measured: the markers' rays.
+            moved: motion of the views' cameras, `[B, 4 W]`.
+
+        Returns:
+            The angles, and their derivatives in the markers' positions, `[B, 2, 3, D]`.
+        """
         return self._seen(self.markers(u), measured, moved)
 
     def _seen(self, places: Tensor, measured: MeasuredRays, moved: Tensor) -> tuple[Tensor, Tensor]:
-        """As `angles`, of markers at `places [B, D, 3]`."""
+        """Return the same as `angles` for markers at `places [B, D, 3]`."""
         to_marker = places.mT - measured.origins
         distance = torch.linalg.vector_norm(to_marker, dim=1, keepdim=True)
         along = (to_marker / distance)[:, None]
@@ -186,49 +197,58 @@ class MarkerResiduals(nn.Module):
         return angle + (measured.motion * moved[:, None, :, None]).sum(2), jacobian
 
     def repeated(self, values: Tensor) -> Tensor:
-        """Values `[..., D]` of the markers for each of the fields that their places follow, of which `vertex_shares` holds the
-        shares, one after the other: here for one, the displacement."""
+        """Repeat values `[..., D]` of the markers for each field that their positions depend on: here the displacement alone.
+
+        `vertex_shares` has the interpolation weights of all these fields.
+        """
         return values
 
     def joined(self, values: Tensor) -> Tensor:
-        """The sum `[..., D]` of values for each of these fields."""
+        """Sum values over these fields, `[..., D]`."""
         return values
 
     def blocks(self, jacobian: Tensor, weighted: Tensor) -> Tensor:
-        """The markers' blocks `J^T w J [B, 3, 3, D]`, from `J` and `w J`, `[B, 2, 3, D]` each."""
+        """Return the markers' blocks `J^T w J [B, 3, 3, D]`, from `J` and `w J`, `[B, 2, 3, D]` each."""
         return (jacobian[:, :, :, None] * weighted[:, :, None]).sum(1)
 
     def near(self, blocks: Tensor) -> Tensor:
-        """The blocks between the inner vertices and those at the first `OFFSETS` from them, `[B, 3, 3, K, N]`."""
+        """Return the blocks between the inner vertices and their neighbours at the first `K` of `OFFSETS`,
+        `[B, 3, 3, K, N]`."""
         near: Tensor = (blocks @ self.pair_shares).unflatten(-1, (len(NEAR), -1))
         return near
 
     def diagonal(self, blocks: Tensor) -> Tensor:
-        """The diagonals `[B, 3, N]` of the blocks between the inner vertices and themselves."""
+        """Return the diagonal of `J^T w J` at the inner vertices, `[B, 3, N]`."""
         own: Tensor = blocks.diagonal(dim1=1, dim2=2).mT @ self.pair_shares[:, : self.vertex_shares.shape[1]]
         return own
 
     def product(self, blocks: Tensor, u: Tensor) -> Tensor:
-        """What the blocks give, `[B, C, 3, N]`, for `u` of that shape."""
+        """Return the products of `J^T w J` with fields `u [B, C, 3, N]`, `[B, C, 3, N]`."""
         shares = self.vertex_shares
         return weighed(blocks[:, None], u @ shares.transpose(0, 1)) @ shares
 
     def loads_alone(self, turned: Tensor, weighted: Tensor) -> Tensor:
-        """`J^T w e [B, D, 2, 3, N]` of every marker by itself, its angles turned by `turned [B, D, 2, 2]` (noise, angle)."""
+        """Return the loads `J^T w e [B, D, 2, 3, N]` of every single marker.
+
+        Args:
+            turned: changes of each marker's angles by independent noises, `[B, D, 2, 2]` (noise, angle).
+            weighted: weighted Jacobian `w J`, `[B, 2, 3, D]`.
+        """
         return torch.einsum("bdra,bacd,dn->bdrcn", turned, weighted, self.vertex_shares)
 
     def misfits(self, angles: Tensor, measured: MeasuredRays, outlier: float, far: float) -> tuple[Tensor, Tensor]:
-        """How far the markers are off their rays, in standard deviations, and as much of it as neighbours have in common.
+        """Return the rms angle of the markers, and the part of it that neighbours have in common, in standard deviations.
 
         Args:
             angles: angles of the markers, `[B, 2, D]`.
             measured: the markers' rays.
-            outlier: as what each marker counts at most, in the first.
-            far: the same in the second.
+            outlier: limit to which each marker's angle is clipped in the first result.
+            far: limit to which each marker's angle is clipped in the second result.
 
         Returns:
-            Rms of the angles `[B]`; the root of the mean product `[B]` of a marker's angles with its nearest neighbours', 0
-            where it is negative. Noise and a marker's wrong match know nothing of the next; what no surface can follow does.
+            The rms angle, `[B]`, and the root of the mean product of a marker's angles with those of its nearest neighbours,
+            `[B]`, 0 if negative. Noise and wrong matches of neighbours are independent; the misfit of a motion that no surface
+            can follow is not.
         """
         weight = measured.weight
         counted = angles.square().mean(1).clamp_max(outlier**2)
@@ -239,13 +259,14 @@ class MarkerResiduals(nn.Module):
         return ((weight * counted).sum(-1) / weight.sum(-1).clamp_min(1)).sqrt(), shared.clamp_min(0).sqrt()
 
     def outlying(self, u: Tensor, measured: MeasuredRays, moved: Tensor, limit: float) -> Tensor:
-        """The share `[B]` of the markers that are seen and more than `limit` standard deviations off their rays."""
+        """Return the share `[B]` of markers that are seen but more than `limit` standard deviations from their rays."""
         far = self.angles(u, measured, moved)[0].square().sum(1) > limit**2
         return (measured.weight * far).mean(-1)
 
 
 def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]:
-    """Every marker's share in what is summed at the inner vertices, `[D, N]`, and at them with those at `NEAR`, `[D, 4 N]`."""
+    """Return the linear interpolation weights of every marker at the inner vertices, `[D, N]`, and their products with the
+    weights at the neighbours `NEAR`, `[D, 4 N]`."""
     m, n = membrane.grid
     vertices, weights = torch.as_tensor(markers.vertices).long(), torch.as_tensor(markers.weights, dtype=torch.float64)
     share = torch.zeros(len(vertices), m * n, dtype=torch.float64).scatter_(1, vertices, weights) * ~membrane.fixed
@@ -256,5 +277,5 @@ def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]
 
 
 def weighed(blocks: Tensor, field: Tensor) -> Tensor:
-    """Blocks `[..., 3, 3, N]` times a field `[..., 3, N]`."""
+    """Multiply blocks `[..., 3, 3, N]` by a field `[..., 3, N]`."""
     return (blocks * field[..., None, :, :]).sum(-2)

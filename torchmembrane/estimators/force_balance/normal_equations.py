@@ -1,4 +1,4 @@
-"""The normal equations of force balance on one grid: linearised, weighted forces and bearing residuals.
+"""The normal equations of force balance on one grid: linearised and weighted forces and bearing residuals.
 
 Fields have their components first and the inner vertices, or the markers, last.
 """
@@ -17,16 +17,22 @@ from .robust import Cauchy
 from .traction_loss import Memory, TractionLoss
 
 DAMPING = 1e-6
-"""Share of the matrix' diagonal that is added to it where nothing else is said."""
+"""Default relative increase of the matrix's diagonal."""
 SLACK = 0.75
-"""Rest tension over shear modulus x thickness, of a prestretch of 1.15, below which a sheet is solved in double precision: so
-little holds it between its markers that float32 moves it by per cents of a press."""
+"""Rest tension relative to shear modulus x thickness (0.75 at a prestretch of 1.15) below which a sheet is solved in double
+precision. It is so compliant between its markers that rounding in float32 displaces it by per cents of a press."""
 
 
 class NormalEquations(NamedTuple):
-    """`M = A^T W A + J^T w J`: the forces' tangent stiffness `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the weighted
-    bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions; `w [B, D]`.
-    Of markers that stand off the surface both are longer, as `LeverResiduals` has them."""
+    """The matrix `M = A^T W A + J^T w J`; the markers' parts are longer for markers with levers, see `LeverResiduals`.
+
+    Attributes:
+        stiffness: tangent stiffness of the forces, `A [B, 3, 3, 7, N]`.
+        weights: weights of the forces, `W [B, 3, 3, N]`.
+        weighted_jacobian: weighted bearing Jacobian in the markers' positions, `w J [B, 2, 3, D]`.
+        marker_blocks: blocks `J^T w J [B, 3, 3, D]` of the markers.
+        marker_weights: weights of the markers, `w [B, D]`.
+    """
 
     stiffness: Tensor
     weights: Tensor
@@ -36,12 +42,12 @@ class NormalEquations(NamedTuple):
 
 
 class BalanceEquations(nn.Module):
-    """The equations of a Gauss-Newton step: what forces and markers ask of the inner vertices.
+    """The equations of a Gauss-Newton step for the inner vertices.
 
     Args:
-        forces: the contact forces.
-        bearings: the markers' angles.
-        loss: the loss of tractions.
+        forces: contact forces.
+        bearings: residuals of the markers.
+        loss: loss of the tractions.
     """
 
     def __init__(self, forces: ContactForce, bearings: MarkerResiduals, loss: TractionLoss):
@@ -63,8 +69,12 @@ class BalanceEquations(nn.Module):
         curvature: bool = False,
         memory: Memory | None = None,
     ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion, Tensor]:
-        """The forces, the normal equations, their loads, the camera's motion and the weights `w_n [B, N]` at a surface; `cone`,
-        `curvature` and `memory` as for `TractionLoss.weights`."""
+        """Linearise the equations at a state; `cone`, `curvature` and `memory` are as for `TractionLoss.weights`.
+
+        Returns:
+            The forces, the normal equations, their loads and corner (see `loads`), the camera's motion, and the weights
+            `w_n [B, N]`.
+        """
         at = self.forces.linearised(u, pressure)
         W, w_n = self.loss.weights(at.normal, at.force, measured.noise_level, tau, cone, curvature, memory)
         angle, jacobian = self.bearings.angles(u, measured, moved)
@@ -73,12 +83,13 @@ class BalanceEquations(nn.Module):
         return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle), w_n
 
     def normal_equations(self, at: Linearised, W: Tensor, jacobian: Tensor, weight: Tensor) -> NormalEquations:
-        """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, with the bearing Jacobian of the angles."""
+        """Return the normal equations of forces with weights `W [B, 3, 3, N]` and angles with a `weight [B, D]`."""
         weighted = self.bearings.repeated(weight)[:, None, None] * jacobian
         return NormalEquations(at.stiffness, W, weighted, self.bearings.blocks(jacobian, weighted), weight)
 
     def loads(self, normal: NormalEquations, at: Linearised, angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
+        """Return the loads `v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`, and the corner `f^T W v`, `v^T W v`,
+        `[B]`."""
         W, v = normal.weights, at.volume
         weighted = weighed(W[:, None], torch.stack([at.force, -v], 1))
         of_forces, of_fluid = self.forces.change(at.stiffness, weighted).split(1, 1)
@@ -89,7 +100,7 @@ class BalanceEquations(nn.Module):
         return loads, (of_force, -of_volume)
 
     def motion(self, normal: NormalEquations, measured: MeasuredRays, angle: Tensor) -> CameraMotion:
-        """The camera's motion in the equations, with the angles `r [B, 2, D]`."""
+        """Return the camera's part of the equations, from the angles `r [B, 2, D]`."""
         K, w = measured.motion, normal.marker_weights
         of_each = self.bearings.repeated(K)[:, :, :, None] * normal.weighted_jacobian[:, :, None]
         coupling = of_each.sum(1) @ self.bearings.vertex_shares
@@ -98,12 +109,12 @@ class BalanceEquations(nn.Module):
         return CameraMotion(coupling.flatten(2), own, slope)
 
     def matrix(self, normal: NormalEquations, damping: float | Tensor = DAMPING) -> Matrix:
-        """`M` as `system.factor` takes it, with a share of its diagonal added."""
+        """Return `M` in the form that `system.factor` needs, with the relative increase `damping` of its diagonal."""
         near = self.bearings.near(normal.marker_blocks)
         return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 
     def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
-        """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""
+        """Return `M u` for `u [B, C, 3 N]` without assembling the matrix; `damping` is as for `matrix`."""
         if damping is not None:
             return self.product(normal, u) + damping * self._diagonal(normal).flatten(1)[:, None] * u
         u, change = u.unflatten(-1, (3, -1)), self.forces.change
@@ -111,7 +122,7 @@ class BalanceEquations(nn.Module):
         return (of_forces + self.bearings.product(normal.marker_blocks, u)).flatten(2)
 
     def _diagonal(self, normal: NormalEquations) -> Tensor:
-        """Of `M`, `[B, 3, N]`."""
+        """Return the diagonal of `M`, `[B, 3, N]`."""
         A, (m, n) = normal.stiffness, self.forces.membrane.grid
         squares = (A * (normal.weights[:, :, :, None, None] * A[:, None]).sum(2)).sum(1)
         planes = squares.unflatten(-1, (m - 2, n - 2)).flatten(0, 1)

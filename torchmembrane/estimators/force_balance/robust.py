@@ -1,8 +1,8 @@
-"""Robust losses of iteratively reweighted least squares (IRLS), as functions of a squared residual `r2 = r^2`.
+"""Robust losses for iteratively reweighted least squares (IRLS), as functions of a squared residual `r2 = r^2`.
 
-Each has `loss(r2)` and the weight `loss'(r) / r = 2 d loss / d r2` of the parabola that touches it there. Near zero all are
-`r^2 / 2` (the pseudo-Huber times its own weight there), so that a scale that goes from large to small is graduated
-non-convexity (GNC): the problem begins quadratic.
+Each has `loss(r2)` and the weight `loss'(r) / r = 2 d loss / d r2` of the parabola that touches the loss at `r`. Near zero all
+losses are `r^2 / 2` (pseudo-Huber: times its weight at zero). Decreasing the scale is therefore graduated non-convexity (GNC):
+the problem starts quadratic.
 
 Reference: Barron 2019, A general and adaptive robust loss function; Blake and Zisserman 1987, Visual reconstruction.
 """
@@ -15,7 +15,7 @@ Scalar = TypeVar("Scalar", float, Tensor)
 
 
 def geman_mcclure_weight(ratio: Scalar) -> Scalar:
-    """`loss'(r) / r` of Geman and McClure's loss, from `ratio = r^2 / s^2`, `[...]`; in 0..1.
+    """Return the weight `loss'(r) / r` of Geman and McClure's loss, in 0..1, from `ratio = r^2 / s^2`, `[...]`.
 
     Example:
         >>> geman_mcclure_weight(1.0)
@@ -26,7 +26,7 @@ def geman_mcclure_weight(ratio: Scalar) -> Scalar:
 
 
 def geman_mcclure_curvature(ratio: Scalar) -> Scalar:
-    """`loss''(r)` of Geman and McClure's loss, from `ratio = r^2 / s^2`, `[...]`; negative beyond `ratio = 1/3`.
+    """Return `loss''(r)` of Geman and McClure's loss from `ratio = r^2 / s^2`, `[...]`; negative for `ratio > 1/3`.
 
     Example:
         >>> geman_mcclure_curvature(1.0)
@@ -37,7 +37,7 @@ def geman_mcclure_curvature(ratio: Scalar) -> Scalar:
 
 
 def geman_mcclure_loss(r2: Scalar, scale: Any) -> Scalar:
-    """Geman and McClure's loss of `r^2 [...]` at a scale `s`, a number or a tensor `[]`.
+    """Return Geman and McClure's loss for `r2 = r^2 [...]` and a scale `s`, a number or a tensor `[]`.
 
     Example:
         >>> geman_mcclure_loss(4.0, 2.0)
@@ -48,10 +48,10 @@ def geman_mcclure_loss(r2: Scalar, scale: Any) -> Scalar:
 
 
 class GemanMcClure(NamedTuple):
-    """`r^2 / (2 (1 + r^2 / s^2))`: saturates at `s^2 / 2`, what lies far out has no more weight.
+    """Geman and McClure's loss `r^2 / (2 (1 + r^2 / s^2))`, which saturates at `s^2 / 2`: large residuals have no weight.
 
     Args:
-        scale: `s`, a number or a tensor `[]`.
+        scale: scale `s`, a number or a tensor `[]`.
 
     Example:
         >>> import torch
@@ -62,23 +62,23 @@ class GemanMcClure(NamedTuple):
     scale: float | Tensor
 
     def loss(self, r2: Tensor) -> Tensor:
-        """The loss, of the shape of `r2`."""
+        """Return the loss, of the shape of `r2`."""
         return geman_mcclure_loss(r2, self.scale)
 
     def weight(self, r2: Tensor) -> Tensor:
-        """The weight, of the shape of `r2`, in 0..1."""
+        """Return the weight, in 0..1, of the shape of `r2`."""
         return geman_mcclure_weight(r2 / self.scale**2)
 
     def curvature(self, r2: Tensor) -> Tensor:
-        """The second derivative in `r`, zero where it is negative."""
+        """Return the second derivative with respect to `r`, or zero where it is negative."""
         return geman_mcclure_curvature(r2 / self.scale**2).clamp_min(0)
 
 
 class Cauchy(NamedTuple):
-    """`s^2 / 2 log(1 + r^2 / s^2)`: grows ever more slowly, an outlier pulls less the farther it is.
+    """The Cauchy loss `s^2 / 2 log(1 + r^2 / s^2)`: the influence of an outlier decreases with its distance.
 
     Args:
-        scale: `s`, a number or a tensor `[]`.
+        scale: scale `s`, a number or a tensor `[]`.
 
     Example:
         >>> import torch
@@ -89,19 +89,19 @@ class Cauchy(NamedTuple):
     scale: float | Tensor
 
     def loss(self, r2: Tensor) -> Tensor:
-        """The loss, of the shape of `r2`."""
+        """Return the loss, of the shape of `r2`."""
         return self.scale**2 / 2 * (r2 / self.scale**2).log1p()
 
     def weight(self, r2: Tensor) -> Tensor:
-        """The weight, of the shape of `r2`, in 0..1."""
+        """Return the weight, in 0..1, of the shape of `r2`."""
         return 1 / (1 + r2 / self.scale**2)
 
 
 class PseudoHuber(NamedTuple):
-    """`sqrt(r^2 + s^2) - s`: quadratic below `s`, `|r|` above.
+    """The pseudo-Huber loss `sqrt(r^2 + s^2) - s`: quadratic well below `s`, and close to `|r|` well above.
 
     Args:
-        scale: `s`, a number or a tensor `[]`.
+        scale: scale `s`, a number or a tensor `[]`.
 
     Example:
         >>> import torch
@@ -112,9 +112,9 @@ class PseudoHuber(NamedTuple):
     scale: float | Tensor
 
     def loss(self, r2: Tensor) -> Tensor:
-        """The loss, of the shape of `r2`."""
+        """Return the loss, of the shape of `r2`."""
         return (r2 + self.scale**2).sqrt() - self.scale
 
     def weight(self, r2: Tensor) -> Tensor:
-        """The weight, of the shape of `r2`, at most `1 / s`."""
+        """Return the weight, at most `1 / s`, of the shape of `r2`."""
         return (r2 + self.scale**2).rsqrt()

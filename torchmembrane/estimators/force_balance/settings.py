@@ -1,4 +1,4 @@
-"""Settings of force balance: immutable, and checked at construction."""
+"""Settings of force balance: immutable and checked at construction."""
 
 from dataclasses import dataclass
 from functools import wraps
@@ -8,7 +8,7 @@ from ...errors import MembraneError
 
 S = TypeVar("S")
 OUTLIER_DECAY_POWER = 1.3
-"""The scale of the markers' loss falls with this power of tau: it begins at twenty times its last value."""
+"""The scale of the markers' loss is proportional to this power of tau: it starts at twenty times its last value."""
 OLD_NAMES = {
     "decline": "gnc_fraction",
     "largest_outlying": "largest_outlier_share",
@@ -22,11 +22,11 @@ OLD_NAMES = {
     "unexplained_of_press": "unexplained_per_displacement",
     "worse_objective": "retry_acceptance_ratio",
 }
-"""Names of settings before 0.2.0, which are still accepted, and their names now."""
+"""Names of settings before 0.2.0, which are still accepted, and their present names."""
 
 
 def accepts_old_names(settings: type[S]) -> type[S]:
-    """The class, whose constructor takes `OLD_NAMES` as well."""
+    """Make the constructor of a settings class accept `OLD_NAMES` too, and return the class."""
     init = settings.__init__
 
     @wraps(init)
@@ -44,70 +44,69 @@ class ForceBalanceSettings:
     """Settings of `ForceBalance`. Lengths are relative to the surface's size, tractions to the reference traction `p0`.
 
     Args:
-        steps: number of steps from rest on a grid that has no coarser one.
-        coarse_steps: number of steps from rest on a grid that a finer one follows.
+        steps: number of steps from rest on a single grid, without coarser ones.
+        coarse_steps: number of steps from rest on the coarsest of several grids.
         fine_steps: number of steps from the solution of the coarsest grid.
         finer_steps: number of steps from the solution of any other grid.
         tau: first and last scale of the loss of compressive traction, from rest.
-        fine_tau: the same from the coarsest grid's solution. Finer grids begin with the last scale, so as to stay in its basin.
-        sharp_tau: the same from rest on the grid of the dents, in a second try.
-        retry_steps_factor: number of steps from rest in a second try, over that in the first.
+        fine_tau: the same from the coarsest grid's solution. Finer grids start with the last scale, to stay in its basin.
+        sharp_tau: the same from rest on the second coarsest grid, in a second try.
+        retry_steps_factor: number of steps from rest in a second try, relative to the first.
         retry_tau: `tau` of a second try.
         retry_fine_tau: `fine_tau` of a second try.
-        settling_steps: number of further steps of a second try, at its last scale, on grids finer than that of the dents.
-        settled_step_tol: rms of the last step below which a solution has settled and is not solved again.
-        camera_motion: scale of the prior of the camera's motion against the rim, px, as tau ends: smaller motions are ignored,
-            larger ones are barely penalised further.
-        gnc_fraction: share of the steps over which tau declines.
-        sparsity: twice the loss of the compressive traction p0 on the whole surface, while it is quadratic.
-        scale_reach: radius of the surroundings whose largest push sets the scale of a vertex's tractions.
+        settling_steps: number of additional steps of a second try, at its last scale, on all but the two coarsest grids.
+        settled_step_tol: rms of the last step below which a solution has settled, so that there is no second try.
+        camera_motion: scale of the prior of the camera's motion relative to the rim at the last tau, px: smaller motions are
+            ignored, larger ones are barely penalised further.
+        gnc_fraction: share of the steps in which tau decreases.
+        sparsity: twice the loss of the uniform compressive traction p0 on the whole surface, while the loss is quadratic.
+        scale_reach: radius of the neighbourhood whose largest push (compressive traction) sets a vertex's scale of tractions.
         scale_share: share of that push below which a push is small.
-        far_share: the same share of the largest push of the whole surface.
-        noise_share: the same share of the push that the markers' noise alone makes, while all losses are quadratic.
-        contact_noise: pushes of so many times the noise's push are contacts, if they are large compared with those around them.
-        evidence: by how much a solution must be likelier than the surface at rest, over the mean gain of the markers' noise
-            alone, for any part of it to be a contact.
-        least_scale: smallest scale of tractions, over p0.
+        far_share: the same as a share of the largest push on the whole surface.
+        noise_share: the same as a share of the push caused by the markers' noise alone, while all losses are quadratic.
+        contact_noise: smallest ratio of a contact's push to the push due to noise; it must be large for its neighbourhood too.
+        evidence: smallest decrease of the objective from the surface at rest for a solution to have contacts, relative to the
+            mean decrease due to the markers' noise alone.
+        least_scale: smallest scale of tractions, relative to p0.
         decrease: how fast that scale may fall with tau.
-        friction: weight of the loss of shear traction, over that of the compressive one.
-        slip: scale of the loss of shear traction, from which on it is linear.
-        cone: by how much less shear weighs where something pushes.
-        coarse_cone: the same on the coarsest grid, whose own error looks like friction under a contact.
-        reach: radius of the surroundings that decide whether a vertex is pushed.
-        renewal: share of a step's own weights of normal tractions in their geometric mean with those of the step before. A
-            vertex that is pushed after one step and pulled after the next settles in this way.
-        floor: smallest weight of a compressive traction. Without it, nothing determines where a vertex under a contact is.
-        outlier: scale of the markers' loss, over their noise.
-        coarse_outlier: the same on grids that a finer one follows. What these grids cannot follow must not cost them markers.
-        pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure). Use
-            this value for better gauges as well.
+        friction: weight of the loss of shear traction, relative to that of compressive traction.
+        slip: scale of the loss of shear traction, above which it is linear.
+        cone: how much a push reduces the weight of shear.
+        coarse_cone: the same on the coarsest grid, whose discretisation error looks like friction under a contact.
+        reach: radius of the neighbourhood that determines whether a vertex is pushed.
+        renewal: exponent of a step's own weights of normal tractions in the geometric mean with those of the step before. It
+            makes vertices settle that are alternately pushed and pulled.
+        floor: smallest weight of a compressive traction. Without it, the position of a vertex under a contact is undetermined.
+        outlier: scale of the markers' loss, relative to their noise.
+        coarse_outlier: the same on coarser grids, which must not reject markers because of their discretisation error.
+        pressure_noise: standard deviation of a measured pressure, relative to the reference traction (mostly the rest
+            pressure). Use this value for better gauges as well.
         longest_step: largest step of a vertex.
-        largest_stretch: largest relative change of the length of an edge of the grid in one step.
-        damping: share of the diagonal of a step's matrix that is added to it as tau ends; it falls with the square of tau.
-        settling_damping: the same in the last steps of a schedule, which settle.
+        largest_stretch: largest relative change of an edge of the grid in one step.
+        damping: relative increase of the diagonal of a step's matrix at the last tau; it is proportional to the square of tau.
+        settling_damping: the same in the last steps of a schedule, in which the solution settles.
         retry_damping: the same in the `settling_steps`.
         coarsest: smallest number of lines of a coarser grid.
         largest_relative_step: largest rms of the last step of a converged solution.
-        largest_volume_error: largest volume error of a converged solution, over the rest volume.
-        largest_misfit: largest rms of the markers' angles off their rays, over their noise and the model's error, that a
-            surface of this sensor explains; more on grids of fewer than `force_balance.MIN_RESOLVED_LINES` lines.
-        misfit_per_displacement: what is added to it for a surface that has moved by its size (rms), because the grid's error
-            grows with the press.
+        largest_volume_error: largest volume error of a converged solution, relative to the rest volume.
+        largest_misfit: largest rms of the angles between markers and rays, in standard deviations, that a surface of this
+            sensor explains; it is larger on grids of fewer than `force_balance.MIN_RESOLVED_LINES` lines.
+        misfit_per_displacement: increase of this limit per displacement (rms), because the grid's error grows with the press.
         largest_unexplained: largest objective without the normal-compression term, per marker seen, that a surface of this
-            sensor explains; more on coarse grids, as above.
-        unexplained_per_displacement: what is added to it for a surface that has moved by its size (rms).
+            sensor explains; it is larger on coarse grids, as above.
+        unexplained_per_displacement: increase of this limit per displacement (rms).
         largest_shared_misfit: largest misfit that neighbouring markers have in common, in standard deviations, that a surface
-            explains. A torn or sheared image moves neighbours alike, as no surface does.
-        largest_doubt: largest sum of the shares of `largest_unexplained` and `largest_shared_misfit`, because a skin that is no
-            membrane has some of both; and how much larger the sum may be, times the size over the displacement (rms), because
-            a rest image that has aged looks the same while the surface hardly moves.
-        largest_pushed: largest share of the surface that contacts push. Where all of it is pushed, nothing distinguishes the
-            fluid's pressure from that of a contact.
-        likely_objective: largest objective, per marker seen, of a solution that is not solved again: of one with a contact
-            where nothing moves, of one with any contact, and of one without; more on coarse grids, as above.
-        likely_per_displacement: what is added to the first, up to the second, for a surface that has moved by its size (rms).
-        retry_acceptance_ratio: objective of a second solution, over that of a converged first one, below which it is taken.
-        largest_outlier_share: largest share of the markers that may be `far` off without a second try.
+            explains. A torn or sheared image moves neighbours alike, which no surface does.
+        largest_doubt: largest sum of the quantities that `largest_unexplained` and `largest_shared_misfit` limit, each relative
+            to its limit, because a skin that is not a membrane has some of both; then the increase of this sum per inverse
+            displacement (rms), because rest-image drift looks the same while the surface hardly moves.
+        largest_pushed: largest share of the surface in contact. If all of it is pushed, the fluid's pressure cannot be
+            distinguished from that of a contact.
+        likely_objective: largest objective, per marker seen, without a second try: for a contact without displacement, for any
+            contact, and without contacts; it is larger on coarse grids, as above.
+        likely_per_displacement: increase of the first limit per displacement (rms), up to the second.
+        retry_acceptance_ratio: objective relative to that of a converged first solution, below which a second one replaces it.
+        largest_outlier_share: largest share of markers farther than `far` from their rays without a second try.
 
     Example:
         >>> [(tau, round(outlier, 1)) for tau, outlier in ForceBalanceSettings().gnc_schedule(2, (4.0, 0.4))]
@@ -176,11 +175,12 @@ class ForceBalanceSettings:
 
     @property
     def far(self) -> float:
-        """Angle of a marker off its ray, over its noise, beyond which its size tells nothing more."""
+        """Angle between a marker and its ray, relative to its noise, beyond which its size carries no information."""
         return 4 * self.outlier
 
     def gnc_schedule(self, steps: int, tau: tuple[float, float]) -> list[tuple[float, float]]:
-        """Scales of the losses in every step, graduated non-convexity: of compressive tractions (tau), of markers."""
+        """Return the scales of the losses of compressive traction (tau) and of markers in every step: graduated
+        non-convexity."""
         first, last = tau
         taus = [first * (last / first) ** min(1.0, k / (self.gnc_fraction * (steps - 1))) for k in range(steps)]
         return [(tau, self.outlier * (tau / last) ** OUTLIER_DECAY_POWER) for tau in taus]

@@ -1,8 +1,9 @@
-"""Initial guesses: a dent in the middle of every contact, from which the steps start.
+"""Initial guesses: surfaces with a dent in the middle of every contact, from which the steps start.
 
-One camera sees of a narrow contact hardly more than how its markers moved across the rays. A dent and a low mound ringed by
-pushes look alike in this. From a smooth surface, found on a grid too coarse for the dent, the steps find the mound: a minimum
-whose tractions cost several times those of the dent. From a dent they find the dent; where there is none, it fills.
+In a narrow contact one camera sees little more than the motion of the markers across their rays, which is similar for a dent
+and for a low mound with pushes around it. Starting from a smooth surface, found on a grid that is too coarse for the dent, the
+steps converge to the mound: a local minimum whose tractions cost several times those of the dent. Starting from a dent they
+find the dent; if there is none in truth, it disappears.
 """
 
 from collections.abc import Sequence
@@ -19,27 +20,27 @@ from .gauss_newton import GaussNewton, State
 from .marker_residuals import MeasuredRays
 from .traction_loss import is_significant
 
-DEPTH = 0.05  # over the surface's size
-WIDTH = 0.1  # standard deviation, over the size
+DEPTH = 0.05  # of the dent, relative to the surface's size
+WIDTH = 0.1  # of the dent (standard deviation), relative to the size
 DEEP_DENT, WIDE_DENT = (0.16, 0.08), (0.25, 0.15)  # depth and width of dents for presses that the first dent does not find
-REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
-FAINT_PUSH = 1.0  # over the push that the markers' noise makes: a fainter push hardly dents the surface
-CENTRE_RADIUS = 0.04  # of the middle of a contact, over the size
-RING_SHARE = 0.1  # push in the middle over the largest push, below which a contact is ring-shaped
-ACCEPTANCE_RATIO = 0.9  # objective of another solution over the one that is kept, below which it is taken
-TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle finite where nothing pushes
+REACH = 0.25  # radius of the neighbourhood whose pushes have a common middle, relative to the size
+FAINT_PUSH = 1.0  # relative to the push due to the markers' noise; a fainter push hardly dents the surface
+CENTRE_RADIUS = 0.04  # radius of the middle of a contact, relative to the size
+RING_SHARE = 0.1  # push in the middle relative to the largest push, below which a contact is ring-shaped
+ACCEPTANCE_RATIO = 0.9  # objective of another solution relative to the best so far, below which it is accepted
+TINY = 1e-12  # squared push relative to the reference traction; keeps the middle finite without pushes
 
 Schedule = list[tuple[float, float]]
 Found = tuple[State, Tensor]
 Stepped = Sequence[Tensor]
-"""A `State`, and the displacement a step before."""
+"""A `State`, and the displacement one step before it."""
 
 
 class InitialGuess(nn.Module):
-    """Surfaces that are dented where something pushes.
+    """Adds dents to surfaces in the middle of their contacts.
 
     Args:
-        gauss_newton: Gauss-Newton steps of the grid, which knows the pushes.
+        gauss_newton: Gauss-Newton steps on the same grid, which provide the tractions.
     """
 
     around: Tensor
@@ -58,17 +59,17 @@ class InitialGuess(nn.Module):
 
     @traced
     def forward(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
-        """The state, its surface dented where the middle of the pushes around, weighted by their squares, is near."""
+        """Return the state with dents near the centroids of the pushes, which are weighted by their squares."""
         return self._dented(u, pressure, moved, measured, DEPTH, WIDTH)
 
     @traced
     def deep(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
-        """The state, dented deeper."""
+        """Return the state with deeper dents."""
         return self._dented(u, pressure, moved, measured, *DEEP_DENT)
 
     @traced
     def wide(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
-        """The state, dented deeper and wider."""
+        """Return the state with deeper and wider dents."""
         return self._dented(u, pressure, moved, measured, *WIDE_DENT)
 
     def _dented(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays, depth: float, width: float) -> State:
@@ -85,8 +86,14 @@ class InitialGuess(nn.Module):
         return State(u - inwards[..., None] * normals, pressure, moved)
 
     def is_ring_shaped(self, found: Equilibrium, membrane: Membrane) -> Tensor:
-        """`[B]` bool: hardly anything pushes in the middle of a contact, as where a mound ringed by pushes is found in place of
-        a dent, or where two contacts are close; `membrane`: of the finer grid on which the solution was found."""
+        """Return where the push in the middle of a contact is small, `[B]` bool.
+
+        This is the case if a mound with pushes around it was found in place of a dent, or if two contacts are close.
+
+        Args:
+            found: the solution.
+            membrane: the rest surface on the finer grid on which the solution was found.
+        """
         p0 = self.gauss_newton.equations.loss.reference
         pushes = (-(found.traction * membrane.normals(found.vertices)).sum(-1) / p0).clamp_min(0)
         pushes = torch.where(is_significant(found.reference / p0), pushes, 0.0)
@@ -100,11 +107,18 @@ class InitialGuess(nn.Module):
         return torch.lt((near * pushes).sum(-1) / near.sum(-1), RING_SHARE * pushes.amax(-1))
 
     def best_of_starts(self, quick: State, slow: State, rest: State, measured: MeasuredRays, schedule: Schedule) -> Found:
-        """The best solution from several starts, and the displacement a step before it.
+        """Return the best solution from several starts, and the displacement one step before it.
 
-        The starts are dents of two states and two states found from `rest` on this grid: one by a loss that is sharp from the
-        beginning, one without a cone, so that shear is expensive even under a push. Of solutions that are about as good, the
-        first is taken, so that answers do not jump between them.
+        Four starts are dented states. Two more are found from `rest` on this grid: one with a loss that is sharp from the
+        beginning, one without a cone, so that shear is expensive even under a push. Among solutions with a similar objective
+        the first is chosen, so that results do not jump between them.
+
+        Args:
+            quick: state from the first try's schedule, to be dented.
+            slow: state from the second try's schedule, to be dented.
+            rest: rest state.
+            measured: the markers' rays.
+            schedule: scales of the losses in every step.
         """
         settings = self.gauss_newton.settings
         steps = 2 * settings.steps
@@ -128,7 +142,7 @@ class InitialGuess(nn.Module):
 
     @traced
     def lower(self, kept: Stepped, other: Stepped, measured: MeasuredRays) -> Stepped:
-        """`other` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
+        """Return `other` in the rows where its objective is clearly lower or that of `kept` is NaN, and `kept` elsewhere."""
         of_kept, of_other = (
             self.gauss_newton.objective(State(*each[:3]), *self.gauss_newton.tractions(*each[:2]), measured)
             for each in (kept, other)

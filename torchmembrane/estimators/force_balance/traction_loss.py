@@ -1,20 +1,23 @@
-"""The loss of contact tractions: few, large and compressive ones are cheap.
+"""The loss of contact tractions, which favours few, large and compressive tractions.
 
-A traction `q` of a vertex has the normal part `q_n` (outward positive: tensile) and the shear part `q_t`. With `s = -q_n / p0`,
+A traction `q` of a vertex has the normal part `q_n` (positive outwards: tensile) and the shear part `q_t`. With
+`s = -q_n / p0`,
 
     loss / area = sparsity / size^2 [ f(s) + kappa (sqrt(|q_t|^2 / p0^2 + slip^2) - slip) ],
 
-`f` Geman-McClure of scale `tau` where the vertex is pushed, `s^2 / 2` where it is pulled, and `kappa = friction / (1 + cone
-S)`. Both ask the vertex's surroundings: `S` is the rms push over a Gaussian neighbourhood, for contacts are patches.
+where `f` is Geman-McClure's loss of scale `tau` for a push (compressive traction), `s^2 / 2` for a tensile traction, and
+`kappa = friction / (1 + cone S)`. Because contacts are patches, the weights depend on the neighbourhood: `S` is the rms push
+over a Gaussian neighbourhood.
 
-A light touch, smeared over many vertices, pushes with far less than `p0`. So every traction is measured against what can be
-expected around it: not `p0` but `rho p0`, with
+A light touch, smeared over many vertices, pushes with far less than `p0`. Every traction is therefore measured relative to
+`rho p0` instead of `p0`, with
 
     rho = min(1, max(c M, c_far max S, z sigma) / tau_last),
 
-`M` the largest push `S` of the vertex's wider surroundings (a power mean), `sigma` the push that the markers' noise alone
-makes there. The loss is that of `q / rho`: whatever its scale, a touch looks the same, and noise below `z sigma` never looks
-like one. (As iterative reweighting for sparse recovery ties its epsilon to the largest entries: Daubechies et al. 2010.)
+the largest push `M` in a wider neighbourhood (a power mean of `S`), and the push `sigma` there due to the markers' noise alone.
+The loss is evaluated at `q / rho`, so that it is the same for light and strong touches, and noise below `z sigma` is never
+taken for a touch. (Likewise, iterative reweighting for sparse recovery ties its epsilon to the largest entries: Daubechies et
+al. 2010.)
 """
 
 from typing import NamedTuple
@@ -28,18 +31,24 @@ from ..precision import rounded_to_float32
 from .robust import GemanMcClure, PseudoHuber
 from .settings import ForceBalanceSettings
 
-POWER = 4  # of squared pushes, in the mean that stands for the largest around
-NO_CONTACT_SCALE = 1e6  # over p0: no push comes near it
-NEGLIGIBLE = 1e-6  # weight of a vertex far away, over that of the one in the middle
-TINY = 1e-12  # keeps roots and quotients of what vanishes finite
+POWER = 4  # exponent of the power mean of squared pushes, which approximates their maximum
+NO_CONTACT_SCALE = 1e6  # relative to p0; far above any push
+NEGLIGIBLE = 1e-6  # weight of a distant vertex relative to that of the centre, below which it is zero
+TINY = 1e-12  # keeps roots and quotients of zeros finite
 
 Memory = tuple[Tensor, Tensor | float]
-"""The weights `w_n [B, N]` of the step before, and the share of a step's own in their geometric mean."""
+"""The weights `w_n [B, N]` of the step before, and the exponent of a step's own weights in the geometric mean of both."""
 
 
 class LossTerms(NamedTuple):
-    """Of tractions at the last scale: `compression2` is `S^2 [B, N]`, `scale2` is `rho^2 [B, N]`, and the loss `[B]` has two
-    parts: `pushes`, and `others`, which are tension and shear."""
+    """Loss of tractions at the last scale.
+
+    Attributes:
+        compression2: squared push of the neighbourhood, `S^2 [B, N]`.
+        scale2: squared scale, `rho^2 [B, N]`.
+        pushes: loss of compressive tractions, `[B]`.
+        others: loss of tensile and shear tractions, `[B]`.
+    """
 
     compression2: Tensor
     scale2: Tensor
@@ -48,13 +57,13 @@ class LossTerms(NamedTuple):
 
 
 class TractionLoss(nn.Module):
-    """The loss, and the weights of its reweighted least squares.
+    """The loss of contact tractions, and its weights for iteratively reweighted least squares.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        reference: the traction `p0`.
+        reference: reference traction `p0`.
         cone: see `ForceBalanceSettings`.
-        settings: the other constants.
+        settings: settings with the other constants.
     """
 
     area: Tensor
@@ -80,31 +89,35 @@ class TractionLoss(nn.Module):
         self.register_buffer("noise_gain", self.area.new_zeros(()))
 
     def parts(self, traction: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Normal part over `p0`, squared shear over `p0^2`, and the mean squared push `S^2` around, each `[B, N]`, of tractions
-        `[B, 3, N]`."""
+        """Return normal traction over `p0`, squared shear over `p0^2` and the mean squared push `S^2`, `[B, N]` each.
+
+        Args:
+            traction: tractions, `[B, 3, N]`.
+            normal: outward unit normals, `[B, 3, N]`.
+        """
         p0 = self.reference
         q_n = (traction * normal).sum(1)
         q_t = traction - q_n[:, None] * normal
         return q_n / p0, q_t.square().sum(1) / p0**2, self.compression2(q_n)
 
     def compression2(self, q_n: Tensor) -> Tensor:
-        """The mean squared push `S^2` around, `[B, N]`, of the tractions' normal parts `[B, N]`."""
+        """Return the mean squared push `S^2` of every neighbourhood, `[B, N]`, from the normal tractions `q_n [B, N]`."""
         compression2: Tensor = (-q_n / self.reference).clamp_min(0) ** 2 @ self.surroundings
         return compression2
 
     def pushed(self, compression2: Tensor) -> Tensor:
-        """Share `[B]` of the surface that is pushed more than the last scale `tau`, from `S^2 [B, N]`."""
+        """Return the share `[B]` of the surface with a push above the last scale `tau`, from `S^2 [B, N]`."""
         return (compression2 > self.settings.tau[-1] ** 2).to(self.area.dtype) @ self.area / self.area.sum()
 
     def shear_weight(self, compression2: Tensor, cone: float | Tensor | None = None) -> Tensor:
-        """`kappa [B, N]`; `cone`: default, that of this loss."""
+        """Return `kappa [B, N]`; the default of `cone` is that of this loss."""
         settings, cone = self.settings, self.cone if cone is None else cone
         return settings.friction / (1 + cone * (compression2 + settings.slip**4).sqrt())
 
     def scale2(self, compression2: Tensor, noise_level: Tensor, tau: float | Tensor) -> Tensor:
-        """`rho^2 [B, N]`, from `S^2 [B, N]` and the frames' noise over that at rest `[B]`.
+        """Return `rho^2 [B, N]` from `S^2 [B, N]` and the frames' noise relative to that at rest, `[B]`.
 
-        At least as much as the scale `tau` of the step allows: from rest, where nothing pushes yet, it begins at 1.
+        A lower bound depends on the scale `tau` of the step, so that `rho` starts at 1 from rest, where nothing pushes yet.
         """
         settings, last = self.settings, self.settings.tau[-1]
         top = compression2.amax(-1, keepdim=True).clamp_min(TINY)
@@ -116,13 +129,14 @@ class TractionLoss(nn.Module):
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
     def contact_scale(self, terms: LossTerms, noise_level: Tensor, gain: Tensor) -> Tensor:
-        """What a push that is a contact is measured against, over `p0`, `[B, N]`: `rho`, or where noise explains it, or
-        all that is found, `NO_CONTACT_SCALE`.
+        """Return the scale with which pushes are compared in the search for contacts, relative to `p0`, `[B, N]`.
+
+        It is `rho`, or `NO_CONTACT_SCALE` where noise explains the push, or if noise explains the whole solution.
 
         Args:
-            terms: the tractions of a solution.
-            noise_level: `[B]`, of the frames over that at rest.
-            gain: `[B]`, by how much the objective is below that of the surface at rest, over the markers seen.
+            terms: loss of the tractions of a solution.
+            noise_level: noise of the frames relative to that at rest, `[B]`.
+            gain: decrease of the objective from the surface at rest, per marker seen, `[B]`.
         """
         above = terms.compression2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
         above = above & (gain > self.settings.evidence * self.noise_gain)[:, None]
@@ -138,17 +152,19 @@ class TractionLoss(nn.Module):
         curvature: bool = False,
         memory: Memory | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`: the parabolas that touch the loss of a force; and the
-        `w_n [B, N]` in it.
+        """Return the weights of the contact forces, whose parabolas touch the loss.
 
         Args:
-            normal: `[B, 3, N]` of the inner vertices.
-            force: `[B, 3, N]`.
-            noise_level: `[B]`, of the frames over that at rest.
-            tau: scale of the compressive traction's loss.
-            cone: how much less shear weighs where something pushes; default, that of this loss.
-            curvature: the curvature of a push's loss instead of its weight, zero where it bends down.
-            memory: weights of the step before; `w_n` is then a geometric mean with it.
+            normal: outward unit normals at the inner vertices, `[B, 3, N]`.
+            force: contact forces, `[B, 3, N]`.
+            noise_level: noise of the frames relative to that at rest, `[B]`.
+            tau: scale of the loss of compressive traction.
+            cone: how much a push reduces the weight of shear; default: that of this loss.
+            curvature: whether to use the curvature of a push's loss, zero where it is negative, instead of its weight.
+            memory: weights of the step before; `w_n` is then a geometric mean with them.
+
+        Returns:
+            `W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`, and `w_n [B, N]`.
         """
         q_n, shear2, compression2 = self.parts(force / self.area, normal)
         rho2 = self.scale2(compression2, noise_level, tau)
@@ -166,7 +182,7 @@ class TractionLoss(nn.Module):
         return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one, w_n
 
     def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> LossTerms:
-        """The loss of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""
+        """Return the loss of tractions `[B, 3, N]` at the last scale `tau`, evaluated at each vertex's own push."""
         q_n, shear2, compression2 = self.parts(traction, normal)
         rho2 = self.scale2(compression2, noise_level, self.settings.tau[-1])
         q_n, shear2 = q_n / rho2.sqrt(), shear2 / rho2
@@ -177,12 +193,12 @@ class TractionLoss(nn.Module):
 
 
 def is_significant(scale: Tensor) -> Tensor:
-    """Bool, of the shape of a `contact_scale`: where noise does not explain a push."""
+    """Return where noise does not explain a push, bool, from the result of `contact_scale`."""
     return scale < NO_CONTACT_SCALE / 2
 
 
 def _gaussian_mean(membrane: Membrane, reach: float) -> Tensor:
-    """Weights `[V, V]` of a Gaussian mean over the rest surface; column k is that around vertex k."""
+    """Return the weights `[V, V]` of Gaussian means over the rest surface; column k is the mean around vertex k."""
     weight = torch.exp(-(torch.cdist(membrane.rest, membrane.rest) ** 2) / (2 * reach**2))
     weight = membrane.rest_area[:, None] * torch.where(weight < NEGLIGIBLE, 0.0, weight)
     return weight / weight.sum(0)

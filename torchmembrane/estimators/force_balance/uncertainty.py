@@ -1,32 +1,33 @@
-"""Standard deviations of a force balance: how far marker noise spreads into the surface, the total force and the pressure.
+"""Standard deviations of force balance: propagation of the markers' noise to the surface, the total force and the pressure.
 
-At the solution a small change `e` of the measured angles moves surface and pressure by
+At the solution a small change `e` of the measured angles changes surface and pressure by
 
     [M  m  n] [dx    ]   [J^T w e]
     [m' c  C] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
     [n' C  0] [lambda]   [   0   ]
 
-with `c + 1 / sigma^2` in place of `c` where a gauge reads the pressure, whose own noise of one sigma adds `1 / sigma` to the
-second row; and the camera's motion (`camera_motion`) as the step has it; with `W` the curvature of a push's loss (flat where it
-bends down; shear by its parabola), so that noise of covariance S gives the sandwich `H^-1 J^T w S w J H^-1`. One load per
-marker and direction of its noise, all solved with one factor.
+where the camera's motion (`camera_motion`) is eliminated as in a step. If a gauge reads the pressure, `c + 1 / sigma^2`
+replaces `c`, and the gauge's own noise of one sigma adds `1 / sigma` to the second row. `W` is the curvature of a push's loss
+(zero where it is negative) and the parabola's weight of the shear loss, so that noise of covariance S gives the sandwich
+`H^-1 J^T w S w J H^-1`. There is one load per marker and direction of its noise, all solved with one factor.
 
-**Deviations of a result's force and depth.** A small change of the markers changes the force and the depth by their
-sensitivities, which the transposed equations give: one solve for each wanted number, not for each marker,
+**Deviations of force and depth in every result.** The transposed equations give the sensitivities of force and depth to the
+markers with one solve per wanted number instead of one per marker,
 
     K y = g,    spread^2 = sum_d |w_d (J_d y - K_d T^-1 B y)|^2
 
-with `g` the wanted number's derivative in surface and pressure and the symmetric `K` above. On the estimator's second finest
-grid, which costs little and knows as much. Every marker's noise is what the solve took it for, with a share of the
-displacements in it for the grid and the material; but these err together over many markers, so the spread is too small. What is
-missing was fitted to presses of random sensors (`bench/accuracy/intervals.py`), as standard deviations that add up:
+with the derivative `g` of the wanted number in surface and pressure and the symmetric matrix `K` above. This is solved on the
+estimator's second finest grid, which is cheaper and as accurate. The noise of every marker is the one that the solver assumes,
+including a share of the displacement for errors of grid and material. But these errors are correlated between markers, so the
+spread is too small. The missing part was fitted to presses of random sensors (`bench/accuracy/intervals.py`), as standard
+deviations that add in quadrature:
 
-    of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  RIM_ERROR of it where a contact reaches the rim,
-                    where no contact is found UNDETECTED of what a patch as pushed as the noise pushes would bear
+    of the force    FORCE x spread,  FORCE_SHARE x each component of the force,  RIM_ERROR x force if a contact reaches the rim,
+                    UNDETECTED x the force that noise alone would cause on the whole surface, if no contact is found
     of the depth    spread,  DEPTH sqrt(spread gap),  SAG gap (gap + 2 depth) / size
 
-with `gap` the distance to the markers around the deepest point. What lies between them is not seen: it may dip as much further
-as the surface's curvature and the dent's make of `gap`. The mean of spread and gap has no such reason: it is what fits.
+with the mean distance `gap` to the markers around the deepest point. The surface between them is not seen: the last term
+estimates its sag from `gap` and the curvatures of the surface and the dent. The geometric mean of spread and gap is empirical.
 """
 
 from collections.abc import Callable
@@ -53,15 +54,15 @@ from .settings import ForceBalanceSettings
 
 
 class LinearisedSolution(NamedTuple):
-    """A solution, linearised.
+    """A solution with the linearised equations about it.
 
-    solve        `M^-1` of loads `[B, L, 3 N]`
-    borders      `[B, 2, 3 N]`, `m` and `n`: what the pressure and the volume do to the equations
-    corner       `c` and the compliance `C`, `[B]` each; None where the pressure is fixed (an open cavity)
-    force        `[B, 3, 3 N]`, the total force's derivative in the inner vertices
-    of_pressure  `[B, 3]`, minus its derivative in the pressure
-    motion       the camera's
-    gauge        `1 / sigma` of a gauge's reading, `[B]`, in `c` already; None where there is no gauge
+    solve        applies `M^-1` to loads `[B, L, 3 N]`
+    borders      `[B, 2, 3 N]`, the borders `m` and `n` of pressure and volume
+    corner       `c` and the compliance `C`, `[B]` each; None if the pressure is fixed (an open cavity)
+    force        `[B, 3, 3 N]`, derivative of the total force in the inner vertices
+    of_pressure  `[B, 3]`, minus the derivative of the total force in the pressure
+    motion       the camera's part of the equations
+    gauge        `1 / sigma` of a gauge's reading, `[B]`, already included in `c`; None without a gauge
     """
 
     solve: Callable[[Tensor], Tensor]
@@ -82,11 +83,11 @@ def linearise(
     play: float,
     curvature: bool = False,
 ) -> tuple[Linearised, NormalEquations, LinearisedSolution]:
-    """The equations about a state, and what solves them for small loads.
+    """Linearise the equations about a state, and factor them.
 
     Args:
-        equations: equations of the force balance.
-        cavity: its law.
+        equations: equations of force balance.
+        cavity: law of the cavity's filling.
         state: the solution.
         measured: the markers' rays.
         scales: scales of the losses of tractions and of markers.
@@ -116,14 +117,14 @@ def linearise(
 
 @torch.no_grad()
 def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> tuple[Tensor, Tensor]:
-    """Effects of the markers' noise at rest while all losses are quadratic.
+    """Return effects of the markers' noise at rest while all losses are quadratic.
 
     They are the standard deviation of the push `S [N]`, and the mean decrease `[]` of the objective, per marker, when the
     surface follows the noise.
 
     Args:
-        equations: equations of the force balance.
-        cavity: its law.
+        equations: equations of force balance.
+        cavity: law of the cavity's filling.
         rest: the markers' rays at rest.
         play: scale of the prior of the camera's motion, px, as for `CameraMotion.with_prior`.
     """
@@ -144,19 +145,19 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
 def noise_loads(
     equations: BalanceEquations, normal: NormalEquations, measured: MeasuredRays, motion: CameraMotion, turned: Tensor
 ) -> Tensor:
-    """What noise adds to the equations, the camera's motion eliminated: `[B, 2 D, 3 N]`, of independent noises that turn each
-    marker's angles by `turned [B, D, 2, 2]` (noise, angle): `J^T w e - B' T^-1 K^T w e`."""
+    """Return the loads `J^T w e - B' T^-1 K^T w e` of the markers' noise, with the camera eliminated, `[B, 2 D, 3 N]`;
+    `turned [B, D, 2, 2]` (noise, angle) are the changes of each marker's angles by independent noises."""
     loads = equations.bearings.loads_alone(turned, normal.weighted_jacobian)
     slopes = torch.einsum("bdra,bakd,bd->bdrk", turned, measured.motion, normal.marker_weights)
     return motion.project_out(loads.flatten(3).flatten(1, 2), slopes.flatten(1, 2))
 
 
 def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor]:
-    """What each load does to the inner vertices, `[B, L, 3 N]`, and to the pressure, `[B, L]`; with a gauge, its noise last.
+    """Return the changes of the inner vertices, `[B, L, 3 N]`, and the pressure, `[B, L]`, by each load.
 
     Args:
         solution: the linearised solution.
-        noise_loads: `[B, L, 3 N]`, what one standard deviation of each independent noise adds to the equations, `J^T w e`.
+        noise_loads: loads of one standard deviation of each independent noise, `[B, L, 3 N]`; a gauge's noise is added last.
     """
     if solution.gauge is not None:
         noise_loads = F.pad(noise_loads, (0, 0, 0, 1))
@@ -175,8 +176,8 @@ def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, 
 
 
 def spread(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Standard deviations of the inner vertices `[B, 3 N]`, the total force `[B, 3]` and the pressure `[B]`; arguments as of
-    `changes`."""
+    """Return the standard deviations of the inner vertices `[B, 3 N]`, the total force `[B, 3]` and the pressure `[B]`;
+    arguments as for `changes`."""
     dx, dp = changes(solution, noise_loads)
     dF = dx @ solution.force.mT - dp[..., None] * solution.of_pressure[:, None]
     return _root_sum_square(dx), _root_sum_square(dF), _root_sum_square(dp)
@@ -190,16 +191,16 @@ def standard_deviations(
     observation: Observation,
     marker_noise: float | Tensor,
 ) -> StandardDeviations:
-    """At a solution, of the rays it was found from.
+    """Return the standard deviations of a solution due to the markers' noise.
 
     Args:
         equations: equations of the estimator.
-        cavity: its law.
-        settings: its settings.
+        cavity: law of the cavity's filling.
+        settings: settings of the estimator.
         state: the solution.
-        observation: the rays.
-        marker_noise: standard deviation of every marker's angles, radians; or `[B, D, 2, 3]`, how noise in each of two
-            independent directions turns the rays.
+        observation: the rays that the solution was found from.
+        marker_noise: standard deviation of every marker's angles, radians; or the changes of the rays' directions by two
+            independent components of noise, `[B, D, 2, 3]`.
     """
     measured = equations.bearings.measured(observation)
     noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * tangent_frame(observation.directions)
@@ -217,9 +218,9 @@ def _root_sum_square(changes: Tensor) -> Tensor:
 FORCE, FORCE_SHARE, RIM_ERROR, UNDETECTED = 0.85, 0.026, 0.12, 0.002
 DEPTH, SAG = 0.43, 0.23
 AROUND = 4
-"""Markers around a point."""
+"""Number of markers whose mean distance from a point is the gap around it."""
 FINE = 25
-"""Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
+"""Lines of the coarsest grids used in the fit; on coarser ones the spreads are increased with the square of the grid step."""
 
 
 def of_presses(
@@ -231,16 +232,16 @@ def of_presses(
     membrane: Membrane,
     unseen: Tensor,
 ) -> Deviations:
-    """With the model's error.
+    """Return the standard deviations of force and depth, including the model's error.
 
     Args:
-        noise: noise of force and depth, as `spreads` gives it.
-        force: `[B, 3]`, as found.
-        depth: `[B]`, as found.
-        gap: `[B]`, to the markers around the deepest point, as of `gap_around`.
-        contacts: as found.
+        noise: spreads of force and depth due to noise, from `spreads`.
+        force: the force found, `[B, 3]`.
+        depth: the depth found, `[B]`.
+        gap: mean distance to the markers around the deepest point, from `gap_around`, `[B]`.
+        contacts: the contacts found.
         membrane: the rest surface on the solver's grid.
-        unseen: the force `[]` that noise alone makes, over the whole surface.
+        unseen: force of the push due to noise alone on the whole surface, `[]`.
     """
     coarse = max(1.0, (FINE - 1) / (min(membrane.grid) - 1)) ** 2
     of_force, of_depth = (coarse * spread for spread in noise)
@@ -255,18 +256,18 @@ def of_presses(
 
 
 def depths(membrane: Membrane, u: Tensor) -> Tensor:
-    """Displacements `u [B, V, 3]` along the inward rest normals, `[B, V]`."""
+    """Return the components of displacements `u [B, V, 3]` along the inward rest normals, `[B, V]`."""
     depth: Tensor = -(u * membrane.rest_normals).sum(-1)
     return depth
 
 
 def gap_around(deepest: Tensor, positions: Tensor, confidence: Tensor, membrane: Membrane) -> Tensor:
-    """How far off the markers around a point are, `[B]`, length unit, at rest: the `AROUND` nearest that are seen, in the mean.
+    """Return the mean rest distance `[B]`, length unit, of a point from the `AROUND` nearest markers that are seen.
 
     Args:
-        deepest: `[B, V]`, the vertices' shares in the point.
-        positions: `[D, 3]`, of the markers at rest.
-        confidence: `[B, D]`, 0 for those not seen.
+        deepest: weights of the vertices that define the point, `[B, V]`.
+        positions: rest positions of the markers, `[D, 3]`.
+        confidence: confidence of the markers, `[B, D]`, 0 for those not seen.
         membrane: the rest surface on this grid.
     """
     distance = torch.linalg.vector_norm(positions - (deepest @ membrane.rest)[:, None], dim=-1)
@@ -276,7 +277,7 @@ def gap_around(deepest: Tensor, positions: Tensor, confidence: Tensor, membrane:
 
 
 def shares_of_deepest(depth: Tensor) -> Tensor:
-    """Of the vertices in the deepest point, by their `depth [B, V]`: where several are, all alike."""
+    """Return the weights of the vertices that define the deepest point, from their `depth [B, V]`: equal for equal depths."""
     deepest = (depth == depth.amax(-1, keepdim=True)).to(depth.dtype)
     shares: Tensor = deepest / deepest.sum(-1, keepdim=True)
     return shares
@@ -285,7 +286,7 @@ def shares_of_deepest(depth: Tensor) -> Tensor:
 def spreads(
     gauss_newton: GaussNewton, settings: ForceBalanceSettings, state: State, observation: Observation
 ) -> tuple[Tensor, Tensor]:
-    """Of the force `[B, 3]` and the depth `[B]` at a solution, by the noise that the solve takes the markers to have."""
+    """Return the spreads of force `[B, 3]` and depth `[B]` of a solution, due to the marker noise that the solver assumes."""
     measured = gauss_newton.equations.bearings.measured(observation)
     if gauss_newton.is_native(*state, *measured):
         both = gauss_newton.native.spread(gauss_newton.equations, gauss_newton.cavity, state, measured, settings.outlier)
@@ -296,7 +297,7 @@ def spreads(
 def spreads_by_tensors(
     equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, state: State, measured: MeasuredRays
 ) -> tuple[Tensor, Tensor]:
-    """The same by tensor operations."""
+    """Return the same as `spreads`, computed by tensor operations."""
     membrane = equations.forces.membrane
     scales, play = (settings.tau[1], settings.outlier), settings.camera_motion
     _, normal, solution = linearise(equations, cavity, state, measured, scales, play, curvature=True)
@@ -317,8 +318,8 @@ def spreads_of(
     wanted: Tensor,
     by_pressure: Tensor,
 ) -> Tensor:
-    """Standard deviations `[B, L]` of numbers whose derivatives in the inner vertices are `wanted [B, L, 3 N]` and in the
-    pressure `by_pressure [B, L]`, where all angles `across` have a standard deviation of 1, and a gauge its own."""
+    """Return standard deviations `[B, L]` of numbers with the derivatives `wanted [B, L, 3 N]` in the inner vertices and
+    `by_pressure [B, L]` in the pressure, for a standard deviation of 1 of all angles, and that of a gauge."""
     solved = solution.solve(torch.cat([wanted, solution.borders], 1))
     y, of_gauge = solved[:, :-2], torch.zeros_like(by_pressure)
     if solution.corner is not None:

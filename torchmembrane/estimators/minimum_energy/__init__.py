@@ -1,1 +1,1 @@
-"""Minimum energy: the surface of least elastic energy on the observed rays."""
+"""Minimum energy: the surface with the least elastic energy on the observed rays."""

@@ -1,7 +1,8 @@
-"""Minimum energy: of all surfaces on the observed rays, the one of least elastic energy at the fluid's volume.
+"""Minimum energy: of all surfaces on the observed rays, the one with the least elastic energy at the fluid's volume.
 
-One unknown for each free vertex, its position `t_k` along its ray, `x_k = o_k + t_k d_k`. The stiffness at rest is close to
-that of every frame, so the same step is repeated with its inverse (eqs. 14, 18, 22) until no force is left along the rays.
+Every free vertex has one unknown, its range `t_k` along its ray, `x_k = o_k + t_k d_k`. Because the stiffness at rest is close
+to that of every frame, the solver repeats the same step with the inverse of the rest stiffness (eqs. 14, 18, 22) until no force
+is left along the rays.
 """
 
 from dataclasses import dataclass
@@ -33,10 +34,10 @@ class MinimumEnergySettings:
     """Settings of `MinimumEnergy`.
 
     Args:
-        steps: number of steps of the solve.
+        steps: number of steps of the solver.
 
     Raises:
-        MembraneError: no steps.
+        MembraneError: the number of steps is less than 1.
 
     Example:
         >>> MinimumEnergySettings().steps
@@ -51,20 +52,20 @@ class MinimumEnergySettings:
 
 
 class MinimumEnergy(VertexRays):
-    """Surface of least energy on given rays that keeps the cavity's law (eqs. 18, 22).
+    """Finds the surface with the least energy on given rays that satisfies the cavity's law (eqs. 18, 22).
 
     Args:
         membrane: the rest surface on the solver's grid.
-        elasticity: its material.
-        rest_rays: origins and unit directions `[V, 3]` of the rest rays.
-        filling: the cavity, as for `CavityLaw`.
-        gas: a gas' absolute pressure at rest and its volume.
-        settings: how many steps.
-        flow: what carries the markers' pixels to the grid's vertices; `prepare` alone needs it.
+        elasticity: elastic energy of the membrane.
+        rest_rays: origins and unit directions of the rest rays, `[V, 3]`.
+        filling: filling of the cavity, as for `CavityLaw`.
+        gas: absolute pressure and volume of a gas at rest.
+        settings: settings with the number of steps.
+        flow: interpolates the markers' pixels to the vertices of the grid; only `prepare` needs it.
 
     Limitations:
-        Minimum energy says that no force acts along the rays: where something pushes along them it is wrong, and features
-        narrower than their distance to the camera are flattened.
+        Minimum energy assumes that no force acts along the rays. It is wrong where an object pushes along them, and flattens
+        features that are narrower than their distance to the camera.
     """
 
     element: ClassVar[str] = "triangle"
@@ -91,7 +92,7 @@ class MinimumEnergy(VertexRays):
         self.register_buffer("inverse", self._rest_inverse(rest_rays[1]))
 
     def is_converged(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: no step is left, and the volume is what the cavity's law asks for."""
+        """Return where the next step would be negligible and the volume fulfils the cavity's law, `[B]` bool."""
         volume_error = self.cavity.volume_error(found.volume, found.pressure)
         return ~(found.relative_step > CONVERGED) & ~(volume_error.abs() > CONVERGED)
 
@@ -105,10 +106,10 @@ class MinimumEnergy(VertexRays):
         return inverse
 
     def forward(self, observation: Observation) -> Equilibrium:
-        """The surface on the rays of the grid's vertices.
+        """Reconstruct the surface from the rays of the grid's vertices.
 
         Args:
-            observation: the ray of every vertex now, `[..., V, 3]`.
+            observation: measured rays of all vertices, `[..., V, 3]`.
         """
         origins, directions = self.rays(observation.origins, observation.directions)
         t, latest, changes = self.start(origins, directions)
@@ -118,7 +119,7 @@ class MinimumEnergy(VertexRays):
 
     @traced
     def rays(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Rays `[..., 3, V]` on which the rim stays: `d = 0`."""
+        """Return the rays `[..., 3, V]`, with zero directions for fixed vertices, so that the rim does not move."""
         fixed = self.membrane.fixed
         origins = torch.where(fixed, self.membrane.rest.mT, origins.mT).contiguous()
         directions = torch.where(fixed, 0.0, directions.mT).contiguous()
@@ -126,26 +127,26 @@ class MinimumEnergy(VertexRays):
 
     @traced
     def start(self, origins: Tensor, directions: Tensor) -> State:
-        """Ranges `[..., V]` and history after the first step, from rest, on rays as `rays` gives them."""
+        """Return the ranges `[..., V]` and the history after the first step from rest, on rays from `rays`."""
         t = self.rest_range.expand(directions[..., 0, :].shape)
         return first(t, self._move(t, origins, directions)[0])
 
     @traced
     def step(self, t: Tensor, latest: Tensor, changes: Tensor, origins: Tensor, directions: Tensor) -> State:
-        """One step in the ranges `t [..., V]`; `latest` and `changes` as `accelerated` has them."""
+        """Take one step in the ranges `t [..., V]`; `latest` and `changes` are as for `accelerated`."""
         move, _ = self._move(t, origins, directions)
         return accelerated(t, move, latest, changes)
 
     @traced
     def equilibrium(self, t: Tensor, origins: Tensor, directions: Tensor) -> Equilibrium:
-        """What these ranges amount to, and how far they are from a solution."""
+        """Return the solution with these ranges, and the length of the next step."""
         x = (origins + t[..., None, :] * directions).mT
         move, pressure = self._move(t, origins, directions)
         error = move.abs().amax(-1) / self.membrane.size
         return Equilibrium.without_tractions(x, pressure, self.membrane.volume(x), error)
 
     def _move(self, t: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the rest's stiffness would have the ranges go, `[..., V]`: zero at the solution; and the pressure `[...]`."""
+        """Return the step of the ranges with the rest stiffness, `[..., V]`, zero at the solution, and the pressure `[...]`."""
         x = origins + t[..., None, :] * directions
         v, rise = self._volume(x, directions)
         load = self.rest_pressure * v + ((self.rest_load - self.energy.gradient(x.mT)).mT * directions).sum(-2)
@@ -156,6 +157,7 @@ class MinimumEnergy(VertexRays):
         return minimum.y, self.rest_pressure - minimum.multiplier
 
     def _volume(self, x: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """The volume's derivative `v [..., V]` along the rays at `x [..., 3, V]`, and its rise above that at rest `[...]`."""
+        """Return the volume's derivative along the rays, `[..., V]`, at `x [..., 3, V]`, and its increase from rest,
+        `[...]`."""
         gradient = self.membrane.volume_gradient(x.mT).mT
         return (gradient * directions).sum(-2), (gradient * x).sum((-1, -2)) / 3 - self.membrane.rest_volume

@@ -1,4 +1,4 @@
-"""From marker displacements in the image to the flow of every grid vertex (section 5)."""
+"""Interpolation of marker displacements in the image to the flow of every grid vertex (section 5)."""
 
 import numpy as np
 import torch
@@ -17,11 +17,11 @@ SMOOTHING_LENGTH = 0.45
 
 
 class VertexFlow(nn.Module):
-    """Where the grid's vertices are seen, from where the markers are.
+    """Computes the pixels of the grid's vertices from those of the markers.
 
     Args:
-        problem: the sensor.
-        interpolation: from the markers' displacements to the flow of the grid's vertices.
+        problem: description of the sensor.
+        interpolation: interpolation of the markers' displacements to the grid's vertices.
     """
 
     rest_pixels: Tensor
@@ -34,23 +34,23 @@ class VertexFlow(nn.Module):
         self.register_buffer("vertex_pixels", problem.vertex_pixels)
 
     def forward(self, pixels: Tensor, confidence: Tensor) -> Tensor:
-        """Pixels `[B, V, 2]` of the vertices, from those of the markers `[B, D, 2]` and their confidence `[B, D]`."""
+        """Return the pixels `[B, V, 2]` of the vertices from those of the markers `[B, D, 2]` and their confidence `[B, D]`."""
         moved: Tensor = self.vertex_pixels + self.interpolation(pixels - self.rest_pixels, confidence)
         return moved
 
 
 class FlowInterpolation(nn.Module):
-    """Smooth image flow on the grid from marker displacements, zero on the rim.
+    """Interpolates marker displacements to a smooth image flow on the grid that is zero on the rim.
 
-    Minimises `sum_d c_d |W_d f - s_d|^2 + alpha |Laplace f|^2` over grid flows `f` that vanish on the rim, with `c_d` the
-    confidence, `W_d` the marker's barycentric weights and the rest surface's own Laplacian. With all markers found this is a
-    constant operator, `f = R s`; for any confidences it is `f = R (c s + (1 - c) z)`, where `z` is `f` at the markers:
-    `z = H (c s + (1 - c) z)`, `H = W R`. Only lost markers are unknowns, so a few conjugate-gradient steps solve it.
+    It minimises `sum_d c_d |W_d f - s_d|^2 + alpha |Laplace f|^2` over grid flows `f` that vanish on the rim, with the
+    confidence `c_d`, the marker's barycentric weights `W_d` and the Laplacian of the rest surface. If all markers are found,
+    this is a constant operator, `f = R s`. For any confidences it is `f = R (c s + (1 - c) z)`, where `z` is `f` at the
+    markers: `z = H (c s + (1 - c) z)`, `H = W R`. Only lost markers are unknown, so a few conjugate gradient steps solve it.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        markers: the markers as points of it.
-        steps: number of steps of the conjugate gradients.
+        markers: the markers as points on the membrane.
+        steps: number of conjugate gradient steps.
 
     Raises:
         MembraneError: fewer than three markers.
@@ -75,11 +75,11 @@ class FlowInterpolation(nn.Module):
         self.register_buffer("influence", at_markers @ W.T)
 
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
-        """The flow `[..., V, 2]` px, from `displacement [..., D, 2]` px and `confidence [..., D]` of the markers."""
+        """Return the flow `[..., V, 2]` px from `displacement [..., D, 2]` px and `confidence [..., D]` of the markers."""
         return (self.completed(displacement, confidence) @ self.spread).mT
 
     def completed(self, displacement: Tensor, confidence: Tensor) -> Tensor:
-        """The displacements `c s + (1 - c) z` of all markers, `[..., 2, D]` px; arguments as for `forward`."""
+        """Return the completed displacements `c s + (1 - c) z` of all markers, `[..., 2, D]` px; arguments as for `forward`."""
         c, displacement = confidence[..., None, :], displacement.mT
         H, lost = self.influence, (1 - c).clamp_min(1e-12).sqrt()  # H is symmetric
         observed = c * torch.where(c > 0, displacement, 0.0)
@@ -88,13 +88,13 @@ class FlowInterpolation(nn.Module):
 
 
 def weights(markers: SurfacePoints, count: int) -> Tensor:
-    """`W [D, V]`: values at markers from those at the grid's vertices."""
+    """Return the matrix `W [D, V]` that interpolates values at the markers from those at the grid's vertices."""
     W = torch.zeros(len(markers.vertices), count, dtype=torch.float64)
     return W.scatter_add_(1, torch.from_numpy(markers.vertices.astype(np.int64)), torch.from_numpy(markers.weights.copy()))
 
 
 def roughness(membrane: Membrane, markers: int) -> Tensor:
-    """`alpha |Laplace f|^2` as a matrix `[V, V]`, for so many markers on the membrane."""
+    """Return the matrix `[V, V]` of `alpha |Laplace f|^2` for a number of markers on the membrane."""
     spacing2 = membrane.rest_area.sum() / markers
     alpha = (2 * SMOOTHING_LENGTH * spacing2.sqrt() / (2 * torch.pi)) ** 4 / spacing2
     L = _laplacian(membrane)
@@ -102,7 +102,7 @@ def roughness(membrane: Membrane, markers: int) -> Tensor:
 
 
 def _laplacian(membrane: Membrane) -> Tensor:
-    """Dense stiffness `L [V, V]` of the Dirichlet energy on the rest surface (cotangent Laplacian)."""
+    """Return the dense stiffness matrix `L [V, V]` of the Dirichlet energy on the rest surface (cotangent Laplacian)."""
     V = len(membrane.rest)
     elasticity = ElasticEnergy(membrane, "harmonic", 1.0)
     one = torch.zeros_like(membrane.rest)

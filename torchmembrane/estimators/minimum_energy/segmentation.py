@@ -1,8 +1,8 @@
-"""Where something touches, from the flow or the surface alone (section 5.1): polar-angle change, regions that bulge in.
+"""Segmentation of contacts from the flow or the surface alone (section 5.1): polar-angle change, regions that bulge inwards.
 
-An inward displacement `-s n` of a point at range `t` turns its ray by `-s (n . e) / t`, where `e` is the direction in which the
-polar angle grows. So `d beta = beta_0 - beta_1` (eq. 29) has the sign of `n . e` where the membrane bulges in: the printed
-`d beta < 0` holds only for a camera above the surface's centre of curvature.
+An inward displacement `-s n` of a point at range `t` turns its ray by `-s (n . e) / t`, where `e` is the direction of
+increasing polar angle. So `d beta = beta_0 - beta_1` (eq. 29) has the sign of `n . e` where the membrane bulges inwards; the
+printed `d beta < 0` holds only for a camera above the surface's centre of curvature.
 """
 
 from typing import NamedTuple
@@ -24,13 +24,18 @@ from ..contacts import (
     region_centroids,
 )
 
-DIVERGENT = 0.9  # outward share of the angular flow above which it diverges everywhere: the contact is on the axis
-ON_AXIS = 0.1  # radius of the region then, over the surface's size
+DIVERGENT = 0.9  # outward share of the angular flow above which it diverges everywhere, so that the contact is on the axis
+ON_AXIS = 0.1  # radius of the region in this case, relative to the surface's size
 
 
 class ContactRegions(NamedTuple):
-    """Contacts of a batch: `bulge [B, V]` (length unit, positive where the membrane bulges in), `region [B, V]` (0 none, else
-    the number of the contact, strongest first), `points [B, P, 3]`, the regions' centroids, NaN-padded."""
+    """Contacts of a batch.
+
+    Attributes:
+        bulge: inward displacement, length unit, `[B, V]`.
+        region: number of the contact, the strongest first, or 0, `[B, V]`.
+        points: centroids of the regions, padded with NaN, `[B, P, 3]`.
+    """
 
     bulge: Tensor
     region: Tensor
@@ -38,17 +43,17 @@ class ContactRegions(NamedTuple):
 
 
 class PolarAngle(nn.Module):
-    """Eq. 29 for points of a rest surface: grid vertices or markers.
+    """Polar-angle change of eq. 29 for points of a rest surface: grid vertices or markers.
 
     Args:
-        points: `[N, 3]` at rest.
-        normals: outward unit normals there, `[N, 3]`.
+        points: points at rest, `[N, 3]`.
+        normals: outward unit normals at the points, `[N, 3]`.
         origins: origins of their rest rays, `[N, 3]`.
         directions: unit directions of their rest rays, `[N, 3]`.
 
     Limitations:
-        Where the rays run along the normals (a camera near the centre of curvature) an inward displacement does not turn them:
-        only the stretch around it is visible.
+        Where the rays are parallel to the normals (a camera near the centre of curvature), an inward displacement does not turn
+        them: only the stretch around it is visible.
     """
 
     range: Tensor
@@ -62,37 +67,38 @@ class PolarAngle(nn.Module):
         self.register_buffer("sign", torch.sign((normals * growing_polar_angle(directions)).sum(-1)))
 
     def change(self, directions: Tensor) -> Tensor:
-        """`d beta = beta_0 - beta_1` in radians, for unit rays `[..., N, 3]` now."""
+        """Return `d beta = beta_0 - beta_1`, radians, for the measured unit directions `[..., N, 3]`."""
         return self.rest - polar_angle(directions)
 
     def bulge(self, directions: Tensor) -> Tensor:
-        """The change times the range, positive where the membrane bulges in, `[..., N]`."""
+        """Return the change times the range, positive where the membrane bulges inwards, `[..., N]`."""
         return self.sign * self.range * self.change(directions)
 
 
 def polar_angle(directions: Tensor) -> Tensor:
-    """Angle between `[..., 3]` and the optical axis, radians (eq. 29: `arccos f / sqrt(u^2 + v^2 + f^2)`)."""
+    """Return the angle between `directions [..., 3]` and the optical axis, radians (eq. 29:
+    `arccos f / sqrt(u^2 + v^2 + f^2)`)."""
     return torch.atan2(torch.linalg.vector_norm(directions[..., :2], dim=-1), directions[..., 2])
 
 
 def growing_polar_angle(directions: Tensor) -> Tensor:
-    """Unit vector across each unit direction along which the polar angle grows, `[..., 3]`; zero on the axis."""
+    """Return the unit vector of increasing polar angle, orthogonal to each unit direction, `[..., 3]`; zero on the axis."""
     across, along = (directions[..., 2:] * directions).split([2, 1], -1)
     return torch.nn.functional.normalize(torch.cat([across, along - 1], -1), dim=-1)
 
 
 class Segmentation(nn.Module):
-    """Contacts of a membrane, from the rays of its grid vertices or from its surface.
+    """Segments contacts of a membrane, from the rays of its grid vertices or from its surface.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        rest_rays: the rest rays of its vertices, `origins` and `directions [V, 3]`.
-        count: how many contacts are reported.
-        patches: patches of the membrane, where they are at hand.
+        rest_rays: origins and unit directions of the vertices' rest rays, `[V, 3]` each.
+        count: largest number of contacts that are reported.
+        patches: contact patches of the membrane, if they exist already.
 
     Limitations:
-        Contacts closer than about a fifth of the surface's size are one. A contact on the axis that turns all rays outwards is
-        a disc of a tenth of that size, however large it is.
+        Contacts closer than about a fifth of the surface's size are not resolved. A contact on the axis that turns all rays
+        outwards is reported as a disc with a radius of a tenth of this size, whatever its true size.
     """
 
     rest_origins: Tensor
@@ -117,37 +123,40 @@ class Segmentation(nn.Module):
 
     @traced
     def by_polar_angle(self, directions: Tensor) -> ContactRegions:
-        """Eq. 29 alone: contacts on the rest surface, for rays `[B, V, 3]`."""
+        """Return the contacts by eq. 29 alone, on the rest surface, for rays `[B, V, 3]`."""
         bulge = self.polar.bulge(directions) * ~self.membrane.fixed
         return self._where(self.membrane.rest.expand(bulge.shape[0], -1, -1), bulge, directions)
 
     @traced
     def by_normals(self, x: Tensor) -> ContactRegions:
-        """Contacts of a surface `[B, V, 3]`: where it lies inside the rest surface, along the mean of both normals.
+        """Return the contacts of a surface `[B, V, 3]`: the regions inside the rest surface, along the mean of both normals.
 
-        Or the axis, where its rays all turn outwards: a dent there is hidden from a camera that looks along the normals.
+        If all rays turn outwards, the contact is on the axis: a camera that looks along the normals cannot see the dent itself.
         """
         return self._inside(x, self.membrane.normals(x))
 
     @traced
     def moved(self, before: Tensor, after: Tensor) -> Tensor:
-        """By how much points `[B, P, 3]` moved at most, over the surface's size, `[B]`; infinite where one came or went."""
+        """Return the largest distance between points `[B, P, 3]` before and after, relative to the surface's size, `[B]`.
+
+        It is infinite if a point appeared or disappeared.
+        """
         distance = torch.linalg.vector_norm(after - before, dim=-1).nan_to_num().amax(-1)
         same = (after.isnan() == before.isnan()).flatten(1).all(1)
         return torch.where(same, distance / self.membrane.size, torch.inf)
 
     @traced
     def in_contact(self, region: Tensor) -> Tensor:
-        """`[B, V]` bool, from the numbers of regions."""
+        """Return which vertices are in contact, `[B, V]` bool, from the numbers of regions."""
         return region > 0
 
     def contacts(self, x: Tensor, normals: Tensor) -> Contacts:
-        """`by_normals` as results have it, 1 in a contact, else 0; the surface's `normals [B, V, 3]` are at hand."""
+        """Return the contacts of `by_normals` in the form of the results, given the surface's `normals [B, V, 3]`."""
         regions = self._inside(x, normals)
         return self.patches.of_regions(x, normals, regions.region, regions.points)
 
     def divergence(self, directions: Tensor) -> Tensor:
-        """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""
+        """Return the outward share of the angular flow, `[B]`: 1 if all rays turn away from the axis, -1 if all turn to it."""
         turned = torch.linalg.vector_norm(directions - self.rest_directions, dim=-1)
         reach: Tensor = self.polar.range * ~self.membrane.fixed
         least = LEAST_BULGE * self.membrane.size
@@ -159,7 +168,7 @@ class Segmentation(nn.Module):
         return self._where(x, bulge, torch.nn.functional.normalize(x - self.rest_origins, dim=-1))
 
     def _where(self, x: Tensor, bulge: Tensor, directions: Tensor) -> ContactRegions:
-        """The regions of `bulge [B, V]` on `x [B, V, 3]`, or where the flow diverges everywhere the axis'."""
+        """Return the regions of `bulge [B, V]` on `x [B, V, 3]`, or the region on the axis if the flow diverges everywhere."""
         divergent = (self.divergence(directions) > DIVERGENT)[:, None] & self.axis_in_view
         region = torch.where(divergent, self.axis_region, bulge_regions(bulge, self.membrane, self.count))
         weight = torch.where(divergent, torch.ones_like(bulge), bulge.clamp_min(0))
@@ -167,7 +176,7 @@ class Segmentation(nn.Module):
 
 
 def _axis_region(membrane: Membrane) -> Tensor:
-    """1 at the vertices `[V]` around the point where the optical axis meets the rest surface, else 0."""
+    """Return 1 for the vertices around the point where the optical axis meets the rest surface, else 0, `[V]`."""
     hit = membrane.ray_points(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
     if not np.isfinite(hit.distance[0]):
         return torch.zeros(len(membrane.rest), dtype=torch.long)

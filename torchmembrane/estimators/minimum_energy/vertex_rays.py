@@ -1,4 +1,4 @@
-"""What the estimators share that give every vertex of the grid a range along its own ray."""
+"""Base class of the estimators whose unknowns are the ranges of the grid's vertices along their rays."""
 
 from typing import Any, ClassVar, Self
 
@@ -24,9 +24,9 @@ class VertexRays(Estimator):
     Args:
         membrane: the rest surface on the solver's grid.
         energy: elastic energy of the membrane.
-        rest_rays: origins and unit directions `[V, 3]` of the rest rays.
-        filling: the cavity, as for `CavityLaw`.
-        gas: a gas' absolute pressure at rest and its volume.
+        rest_rays: origins and unit directions of the rest rays, `[V, 3]`.
+        filling: filling of the cavity, as for `CavityLaw`.
+        gas: absolute pressure and volume of a gas at rest.
         flow: interpolates the markers' pixels to the vertices of the grid; only `prepare` needs it.
     """
 
@@ -50,32 +50,32 @@ class VertexRays(Estimator):
         self.segmentation = Segmentation(membrane, rest_rays, patches=self.patches)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
-        self.register_buffer("rest_load", rest_load.mT.contiguous().mT)  # as forces come: components first in memory
+        self.register_buffer("rest_load", rest_load.mT.contiguous().mT)  # in the memory layout of forces: components first
         self.register_buffer("free", (~membrane.fixed).double())
 
     @classmethod
     def from_problem(cls, problem: Problem, settings: Any = None) -> Self:
-        """The estimator of a sensor; settings as for the class."""
+        """Build the estimator for a sensor; `settings` are those of the class."""
         settings = settings or cls.Settings()
         rays = problem.camera.pixel_to_ray(problem.vertex_pixels)
         flow = VertexFlow(problem, cls.interpolation(problem, settings))
-        build: Any = cls  # with the arguments of the estimators themselves
+        build: Any = cls  # subclasses take settings too
         built: Self = build(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
         return built
 
     @classmethod
     def interpolation(cls, problem: Problem, settings: Any) -> FlowInterpolation:
-        """The flow between the sensor's markers, here smooth."""
+        """Return the interpolation of the flow between the sensor's markers; default: smooth."""
         return FlowInterpolation(problem.membrane, problem.markers)
 
     def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
-        """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`; all are as sure."""
+        """Return the rays of the grid's vertices, moved by the flow of the markers at `pixels [B, D, 2]`, with equal noise."""
         if self.flow is None:
             raise MembraneError(
-                f"{type(self).__name__}.prepare: made without a flow; pass flow, or give forward the vertices' rays"
+                f"{type(self).__name__}.prepare: there is no flow; pass flow, or call forward with the vertices' rays"
             )
         return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
-        """Where the membrane bulges in along its `normals [B, V, 3]` (section 5.1)."""
+        """Return the contacts, where the membrane bulges inwards along its `normals [B, V, 3]` (section 5.1)."""
         return self.segmentation.contacts(found.vertices, normals)

@@ -1,1 +1,1 @@
-"""The paper: its estimator, and the studies that only it needs."""
+"""The paper's estimator, and code that only the paper's study uses."""

@@ -1,8 +1,8 @@
-"""The paper's flow of the grid's vertices, bilinear between the dots (section 5).
+"""The paper's flow of the grid's vertices: bilinear interpolation between the dots (section 5).
 
-For any pattern of dots it is a constant matrix: the dots and the fixed rim are triangulated in the grid's own coordinates;
-pairs of triangles that share their longest edge and make a convex quadrilateral are joined. Inside a quadrilateral the
-interpolation is bilinear, in the triangles left over linear.
+For any pattern of dots it is a constant matrix. The dots and the fixed rim are triangulated in the grid's own coordinates, and
+adjacent triangles that form a convex quadrilateral are joined, the most rectangular pairs first. The interpolation is bilinear
+in the quadrilaterals, and linear in the remaining triangles.
 """
 
 import numpy as np
@@ -16,19 +16,19 @@ from ...surface.projection import SurfacePoints
 from ..minimum_energy.flow import FlowInterpolation
 
 NEWTON_STEPS = 12
-OUTSIDE = 1e-9
-CONVERGED = 1e-6  # grid steps, by which the interpolated place may miss the point
+OUTSIDE = 1e-9  # negative weight that still counts as inside a cell
+CONVERGED = 1e-6  # largest distance between the interpolated position and the point, grid steps
 
 
 class BilinearFlow(FlowInterpolation):
-    """Flow that is bilinear between the dots, zero on the rim; a lost dot has the smooth flow of `FlowInterpolation`.
+    """Interpolates the flow bilinearly between the dots, zero on the rim; lost dots take the flow of `FlowInterpolation`.
 
     Args:
         membrane: the rest surface on the solver's grid.
-        markers: the dots as points of it.
+        markers: the dots as points on the membrane.
 
     Raises:
-        MembraneError: fewer than three dots, or all on one line.
+        MembraneError: there are fewer than three dots, or all are on one line.
     """
 
     bilinear: Tensor
@@ -38,16 +38,17 @@ class BilinearFlow(FlowInterpolation):
         self.register_buffer("bilinear", torch.from_numpy(bilinear_matrix(membrane, markers)))
 
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
-        """The flow `[..., V, 2]` px, from `displacement [..., D, 2]` px and `confidence [..., D]` of the dots."""
+        """Return the flow `[..., V, 2]` px from `displacement [..., D, 2]` px and `confidence [..., D]` of the dots."""
         smooth = self.completed(displacement, confidence) @ self.influence
         at_dots = torch.where(confidence[..., None, :] > 0, displacement.mT, smooth)
         return (at_dots @ self.bilinear.mT).mT
 
 
 def bilinear_matrix(membrane: Membrane, markers: SurfacePoints) -> np.ndarray:
-    """Weights `[V, D]` of the markers' flow at every grid vertex; the flow of the rim is zero and adds nothing.
+    """Return the weights `[V, D]` of the markers' flow at every grid vertex; the flow of the rim is zero and adds nothing.
 
-    Raises `MembraneError` where the markers cannot be triangulated (all on one line).
+    Raises:
+        MembraneError: the markers cannot be triangulated (all on one line).
     """
     m, n = membrane.grid
     index = np.arange(m * n)
@@ -66,12 +67,12 @@ def bilinear_matrix(membrane: Membrane, markers: SurfacePoints) -> np.ndarray:
 
 
 def _cells(points: np.ndarray) -> list[list[int]]:
-    """Quadrilaterals (in order around) and triangles that cover the points' hull."""
+    """Return quadrilaterals (corners in cyclic order) and triangles that cover the points' convex hull."""
     try:
         mesh = Delaunay(points)
     except Exception as error:
         raise MembraneError(
-            f"bilinear_matrix: the markers cannot be triangulated ({error}); expected them spread out"
+            f"bilinear_matrix: the markers cannot be triangulated ({error}); expected markers that are not all on one line"
         ) from error
     pairs = []
     for k, triangle in enumerate(mesh.simplices):
@@ -91,7 +92,7 @@ def _cells(points: np.ndarray) -> list[list[int]]:
 
 
 def _squareness(p: np.ndarray) -> float:
-    """Smallest |sine| over the four corners; negative unless the quadrilateral is convex."""
+    """Return the smallest |sine| of the four corners minus 0.3; negative unless the quadrilateral is clearly convex."""
     edge = np.roll(p, -1, 0) - p
     edge /= np.linalg.norm(edge, axis=1, keepdims=True)
     before = np.roll(edge, 1, 0)
@@ -100,7 +101,7 @@ def _squareness(p: np.ndarray) -> float:
 
 
 def _weights(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the points `q [Q, 2]` lie in the cell with corners `p [3 or 4, 2]`, and their interpolation weights."""
+    """Return which of the points `q [Q, 2]` lie in the cell with corners `p [3 or 4, 2]`, and their interpolation weights."""
     u, v = np.full(len(q), 0.5), np.full(len(q), 0.5)
     twist = p[0] - p[1] + p[2] - p[3] if len(p) == 4 else np.zeros(2)
     along, across = p[1] - p[0], p[-1] - p[0]

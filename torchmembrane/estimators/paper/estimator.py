@@ -1,14 +1,14 @@
-"""The paper's own estimator, whole: flow, local affine maps, Q, smoother, linear volume, KKT, contact segmentation.
+"""The paper's complete estimator: flow, local affine maps, Q, smoother, linear volume, KKT, contact segmentation.
 
     flow at the grid          bilinear between the dots (section 5)
-    local affine maps         of every quadrilateral, with precomputed `G^-1` (eqs. 15-17)
+    local affine maps         one per quadrilateral, with precomputed `G^-1` (eqs. 15-17)
     Q                         their weighted entries, linear in the ranges: energy `1/2 |Q psi - gamma|^2` (eqs. 14, 18)
-    smoother                  `s/2 |S psi|^2` (eq. 28), `psi = t - t_rest`, left out where something touches
+    smoother                  `s/2 |S psi|^2` (eq. 28), `psi = t - t_rest`, omitted in contacts
     volume                    linear, `v.psi = c` (eq. 21)
-    solve                     eq. 22 by the KKT system of eqs. 25-27: two solves with one factor of `Q^T Q + s S^T S`
+    solution                  of eq. 22 by the KKT system of eqs. 25-27: two solves with one factor of `Q^T Q + s S^T S`
     contacts                  eq. 29, then reconstruct, segment along the normals, reconstruct (section 5.1)
 
-The unknowns are the ranges of the grid's vertices along their rays, so that nothing of the energy is neglected; harmonic.
+The unknowns are the ranges of the grid's vertices along their rays, so that no part of the harmonic energy is neglected.
 """
 
 from dataclasses import dataclass
@@ -34,19 +34,19 @@ from ..minimum_energy.segmentation import ContactRegions
 from ..minimum_energy.vertex_rays import VertexRays
 from .bilinear import BilinearFlow
 
-OCCUPIED = 1e-3  # weight of a quadrilateral that lies wholly in a contact, where the energy is the free part's
+OCCUPIED = 1e-3  # weight of quadrilaterals entirely in contact, if only the energy of the free part counts
 FLOWS = {"smooth": FlowInterpolation, "bilinear": BilinearFlow}
-CONVERGED = 0.01  # move of the contacts in the last round, over the surface's size, of a converged frame
+CONVERGED = 0.01  # largest motion of a converged frame's contacts in the last round, relative to the surface's size
 
 
 class QuadraticProgramme(NamedTuple):
     """Eq. 22 on the inner vertices: minimise `1/2 |Q psi - gamma|^2 + s/2 |S psi|^2 - h.psi` subject to `v.psi = c`.
 
-    q         `[B, m-1, n-1, 6, 4]`, Q's rows of every quadrilateral (eq. 18) in the ranges of its four corners
-    stencil   `[B, 13, N]`, `Q^T Q + s S^T S` as `GridSystem` has it
-    load      `[B, N]`, `Q^T gamma + h + p0 v`: the rest load and the rest pressure's share with it
+    q         `[B, m-1, n-1, 6, 4]`, rows of Q of every quadrilateral (eq. 18) for the ranges of its four corners
+    stencil   `[B, 13, N]`, `Q^T Q + s S^T S` in the format of `GridSystem`
+    load      `[B, N]`, `Q^T gamma + h + p0 v`, including the rest load and the rest pressure
     v         `[B, N]`, derivative of the volume (eq. 21)
-    rise      `[B]`, the volume at the rest ranges above that at rest: `-c` of a liquid
+    rise      `[B]`, volume at the rest ranges minus that at rest: `-c` for a liquid
     """
 
     q: Tensor
@@ -57,8 +57,15 @@ class QuadraticProgramme(NamedTuple):
 
 
 class Segmented(NamedTuple):
-    """What the loop of section 5.1 ends with: the last surface, its contacts, those of eq. 29 alone, and by how much the
-    contacts moved in the last round, over the surface's size, `[B]` (infinite where one came or went)."""
+    """Result of the loop of section 5.1.
+
+    Attributes:
+        surface: the last surface.
+        contacts: contacts of the last surface.
+        first: contacts by eq. 29 alone.
+        moved: largest motion of a contact in the last round, relative to the surface's size, `[B]`; infinite if a contact
+            appeared or disappeared.
+    """
 
     surface: Equilibrium
     contacts: ContactRegions
@@ -71,14 +78,14 @@ class PaperSettings:
     """Settings of `PaperEstimator`.
 
     Args:
-        smoothing: weight s of `s |S psi|^2` (eq. 28) over the rest tension.
-        flow: flow of the grid's vertices, "bilinear" between the dots (section 5), or "smooth".
+        smoothing: weight s of `s |S psi|^2` (eq. 28) relative to the rest tension.
+        flow: interpolation of the flow between the dots: "bilinear" (section 5) or "smooth".
         rounds: number of rounds of the reconstruct / segment loop (section 5.1).
-        free_part_only: take the energy over the free part of the membrane only (section 2, item 1): quadrilaterals that lie
-            wholly in a contact weigh next to nothing.
+        free_part_only: whether to count the energy of the free part of the membrane only (section 2, item 1): quadrilaterals
+            entirely in contact get a very small weight.
 
     Raises:
-        MembraneError: an unknown flow, a weight that is not positive, no rounds.
+        MembraneError: the flow is unknown, the weight is not positive, or the number of rounds is less than 1.
 
     Example:
         >>> PaperSettings(rounds=1).smoothing
@@ -95,27 +102,27 @@ class PaperSettings:
             raise MembraneError(f"PaperSettings: flow = {self.flow!r}; expected one of {', '.join(FLOWS)}")
         if not self.smoothing > 0:
             raise MembraneError(
-                f"PaperSettings: smoothing = {self.smoothing}; expected more than 0: the element is blind to the hourglass mode"
+                f"PaperSettings: smoothing = {self.smoothing}; expected more than 0: the element has no hourglass stiffness"
             )
         if self.rounds < 1:
             raise MembraneError(f"PaperSettings: rounds = {self.rounds}; expected at least 1")
 
 
 class PaperEstimator(VertexRays):
-    """Surface of least harmonic energy on given rays at the linearised volume, and the contacts (eqs. 14-29, section 5.1).
+    """Finds the surface with the least harmonic energy at the linearised volume, and its contacts (eqs. 14-29, section 5.1).
 
     Args:
         membrane: the rest surface on the solver's grid.
-        elasticity: of which the rest tension alone is used.
-        rest_rays: origins and unit directions `[V, 3]` of the rest rays.
-        filling: the cavity, as for `CavityLaw`.
-        gas: a gas' absolute pressure at rest and its volume.
-        settings: smoother, flow, rounds.
-        flow: what carries the markers' pixels to the grid's vertices; `prepare` alone needs it.
+        elasticity: elastic energy of the membrane; only its rest tension is used.
+        rest_rays: origins and unit directions of the rest rays, `[V, 3]`.
+        filling: filling of the cavity, as for `CavityLaw`.
+        gas: absolute pressure and volume of a gas at rest.
+        settings: settings of smoother, flow and rounds.
+        flow: interpolates the markers' pixels to the vertices of the grid; only `prepare` needs it.
 
     Limitations:
-        As `MinimumEnergy`: no force is looked for along the rays, so of a press by something hard it finds where, and only a
-        part of the depth. Of a press on the optical axis it finds next to none: the contact is then a disc around the axis.
+        Like `MinimumEnergy`, it assumes that no force acts along the rays. It finds the location of a press by a hard object,
+        but only a part of its depth; on the optical axis it finds almost no depth, and reports a disc around the axis.
     """
 
     Settings: ClassVar[type[PaperSettings]] = PaperSettings
@@ -140,43 +147,43 @@ class PaperEstimator(VertexRays):
 
     @classmethod
     def interpolation(cls, problem: Problem, settings: PaperSettings) -> FlowInterpolation:
-        """The flow between the sensor's markers."""
+        """Return the interpolation of the flow between the sensor's markers."""
         flow: FlowInterpolation = FLOWS[settings.flow](problem.membrane, problem.markers)
         return flow
 
     @property
     def flow_kind(self) -> str:
-        """The flow between the markers: "bilinear" or "smooth"."""
+        """Name of the flow interpolation between the markers: "bilinear" or "smooth"."""
         return self.settings.flow
 
     @property
     def element(self) -> str:
-        """The paper's affine quadrilaterals."""
+        """Name of the paper's finite element."""
         return "quadrilateral"
 
     @property
     def volume(self) -> str:
-        """Linearised once, at the rest ranges (eq. 21)."""
+        """Name of the volume constraint, which is linearised once, at the rest ranges (eq. 21)."""
         return "linear"
 
     def forward(self, observation: Observation) -> Equilibrium:
-        """The surface on the rays of the grid's vertices.
+        """Reconstruct the surface from the rays of the grid's vertices.
 
         Args:
-            observation: the ray of every vertex now, `[B, V, 3]`.
+            observation: measured rays of all vertices, `[B, V, 3]`.
         """
         found = self.reconstruct_and_segment(observation, self.settings.rounds)
         return found.surface._replace(relative_step=found.moved)
 
     def reconstruct_and_segment(self, observation: Observation, rounds: int) -> Segmented:
-        """The loop of section 5.1, a fixed number of times.
+        """Run the loop of section 5.1 a fixed number of times.
 
-        Regions that bulge in by eq. 29 (or the axis, where the flow diverges everywhere); then reconstruct with the smoother
-        relaxed there, take the displacement along the surface's normals, and from it the regions.
+        The first contacts are the regions that bulge inwards by eq. 29, or the axis if the flow diverges everywhere. Each round
+        reconstructs the surface with the smoother relaxed in the contacts, and segments the displacement along its normals.
 
         Args:
-            observation: the rays of the grid's vertices, `[B, V, 3]`.
-            rounds: how often, at least once.
+            observation: measured rays of the grid's vertices, `[B, V, 3]`.
+            rounds: number of rounds, at least 1.
         """
         segmentation = self.segmentation
         first = before = contacts = segmentation.by_polar_angle(observation.directions)
@@ -187,11 +194,11 @@ class PaperEstimator(VertexRays):
 
     @traced
     def solve(self, observation: Observation, relaxed: Tensor) -> Equilibrium:
-        """Eq. 22 once, by two solves with one factor (eqs. 25-27).
+        """Solve eq. 22 once, by two solves with one factor (eqs. 25-27).
 
         Args:
-            observation: the ray of every vertex now, `[B, V, 3]`.
-            relaxed: `[B, V]` bool, vertices in contact, where the slope may jump: the smoother leaves them alone.
+            observation: measured rays of all vertices, `[B, V, 3]`.
+            relaxed: which vertices are in contact, `[B, V]` bool; they are not smoothed, because the slope may jump there.
         """
         programme, rays = self.programme(observation, relaxed)
         loads = torch.stack([programme.load, programme.v], 1)
@@ -206,7 +213,7 @@ class PaperEstimator(VertexRays):
         return Equilibrium.without_tractions(x, pressure, self.membrane.volume(x), torch.zeros_like(pressure))
 
     def programme(self, observation: Observation, relaxed: Tensor) -> tuple[QuadraticProgramme, tuple[Tensor, Tensor]]:
-        """Eq. 22 of these rays, and the rays on which the rim stays: direction 0."""
+        """Return eq. 22 for these rays, and the rays with zero directions at fixed vertices, so that the rim does not move."""
         membrane, grid, free = self.membrane, self.membrane.grid, self.free[:, None]
         directions = observation.directions * free
         origins = torch.where(free > 0, observation.origins, membrane.rest)
@@ -228,20 +235,20 @@ class PaperEstimator(VertexRays):
         return QuadraticProgramme(q, stencil, within(load), within(v), rise), (origins, directions)
 
     def is_converged(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: in the last round of the loop the contacts stayed."""
+        """Return where the contacts did not move in the last round of the loop, `[B]` bool."""
         return found.relative_step <= CONVERGED
 
 
 def _corner_values(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """`[B, V]` at the corners a, b, c, d of every quadrilateral, `[B, m-1, n-1, 4]`."""
+    """Return the values of a field `[B, V]` at the corners a, b, c, d of every quadrilateral, `[B, m-1, n-1, 4]`."""
     g = field.unflatten(-1, grid)
     return torch.stack([g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]], -1)
 
 
 def _quadrilaterals_stencil(K: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Corner matrices `[B, m-1, n-1, 4, 4]` summed to the stencil `[B, 13, N]` of the inner vertices."""
+    """Sum corner matrices `[B, m-1, n-1, 4, 4]` to the stencil `[B, 13, N]` of the inner vertices."""
     a, b, c, d = range(4)
-    at = {a: (0, 1, 0, 1), b: (0, 1, 1, 0), c: (1, 0, 1, 0), d: (1, 0, 0, 1)}  # pads that put a corner's value at its vertex
+    at = {a: (0, 1, 0, 1), b: (0, 1, 1, 0), c: (1, 0, 1, 0), d: (1, 0, 0, 1)}  # pads that move a corner's value to its vertex
 
     def summed(*pairs: tuple[int, int]) -> Tensor:
         return torch.stack([F.pad(K[..., k, other], at[k]) for k, other in pairs]).sum(0)[:, 1:-1, 1:-1].flatten(1)
@@ -253,7 +260,7 @@ def _quadrilaterals_stencil(K: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def _smoother_stencil(relaxed: Tensor, grid: tuple[int, int], free: Tensor) -> Tensor:
-    """`S^T R S` as a stencil `[B, 13, N]`, `R` 0 at `relaxed [B, V]` vertices, else 1; S is the grid's Laplacian (4, -1)."""
+    """Return `S^T R S` as a stencil `[B, 13, N]`; `R` is 0 at `relaxed [B, V]` vertices, else 1, and S the grid's Laplacian."""
     m, n = grid
     kept = F.pad((~relaxed).to(free.dtype).unflatten(-1, grid), (1, 1, 1, 1))
 
@@ -284,7 +291,7 @@ def _smoother_stencil(relaxed: Tensor, grid: tuple[int, int], free: Tensor) -> T
 
 
 def grid_laplacian(psi: Tensor, grid: tuple[int, int]) -> Tensor:
-    """S of eq. 28 for `psi [..., V, C]` (symmetric): every vertex against its neighbours along the grid's lines."""
+    """Apply the symmetric S of eq. 28 to `psi [..., V, C]`: differences between every vertex and its four grid neighbours."""
     laplacian = torch.tensor(
         [[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 2, -1], [-1, 0, -1, 2]], dtype=psi.dtype, device=psi.device
     )

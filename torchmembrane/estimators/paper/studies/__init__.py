@@ -1,1 +1,1 @@
-"""What only the paper's study needs: the Monge form, one dimension."""
+"""Code that only the paper's study needs: the Monge form, and the one-dimensional membrane."""

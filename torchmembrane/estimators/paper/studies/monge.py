@@ -1,13 +1,12 @@
-"""The paper's own unknown: heights at fixed (x, y), `z = s(x, y) + psi(x, y)` (eqs. 5-10, 14, 18, 22; Appendix D).
+"""The paper's own unknowns: heights at fixed (x, y), `z = s(x, y) + psi(x, y)` (eqs. 5-10, 14, 18, 22; Appendix D).
 
-A piece of the membrane with rest slopes `s_x, s_y` moves by the plane map A to x', where the surface has the slopes of
-`s + psi`:
+The plane map A moves a piece of the membrane with rest slopes `s_x, s_y` to x', where the surface has the slopes of `s + psi`:
 
     tr(A^T H A adj G) = m_xx psi_x^2 + m_xy psi_x psi_y + m_yy psi_y^2 + m_x psi_x + m_y psi_y + m_0    (eqs. 55-62)
 
-with G of the rest slopes at x and H of the slopes at x' (eq. 10 prints x for both); the energy is half of it times
-`dx dy / sqrt(det G)`. At fixed (x, y) the volume is exactly linear in psi and the energy is not quadratic, as A depends on psi
-too; at fixed material points (`minimum_energy`) it is the other way round.
+with G from the rest slopes at x and H from the slopes at x' (eq. 10 prints x for both). The energy is half of this times
+`dx dy / sqrt(det G)`. At fixed (x, y) the volume is exactly linear in psi, but the energy is not quadratic, because A depends
+on psi too. At fixed material points (`minimum_energy`) the energy is quadratic, and the volume is not linear.
 """
 
 from typing import NamedTuple
@@ -23,11 +22,11 @@ from ....surface.topology import corners, triangles_of
 from ...base import Equilibrium
 from ..estimator import grid_laplacian
 
-STEEPEST = 20.0  # slope of a rest surface that heights can describe
+STEEPEST = 20.0  # largest ratio of a piece's area to its footprint on a rest surface that heights can describe
 
 
 class Coefficients(NamedTuple):
-    """`m_xx, m_yy, m_xy, m_x, m_y, m_0` of eqs. 57-62, each `[...]`.
+    """The coefficients `m_xx, m_yy, m_xy, m_x, m_y, m_0` of eqs. 57-62, each `[...]`.
 
     Example:
         >>> m = coefficients(torch.eye(2), torch.zeros(2))
@@ -43,13 +42,13 @@ class Coefficients(NamedTuple):
     one: Tensor
 
     def __call__(self, psi_slope: Tensor) -> Tensor:
-        """The quadratic form (56) of the slopes `psi_x, psi_y [..., 2]`."""
+        """Evaluate the quadratic form (56) at the slopes `psi_x, psi_y [..., 2]`."""
         p, q = psi_slope.unbind(-1)
         return self.xx * p**2 + self.xy * p * q + self.yy * q**2 + self.x * p + self.y * q + self.one
 
 
 def adjugate(matrix: Tensor) -> Tensor:
-    """`adj M = det M M^-1` of `[..., 2, 2]`.
+    """Return the adjugate `adj M = det M M^-1` of matrices `[..., 2, 2]`.
 
     Example:
         >>> adjugate(torch.tensor([[1.0, 2.0], [3.0, 4.0]])).tolist()
@@ -60,7 +59,7 @@ def adjugate(matrix: Tensor) -> Tensor:
 
 
 def metric(slope: Tensor) -> Tensor:
-    """First fundamental form of a graph with slopes `[..., 2]` (eqs. 9, 10), `[..., 2, 2]`.
+    """Return the first fundamental form `[..., 2, 2]` of a graph with slopes `[..., 2]` (eqs. 9, 10).
 
     Example:
         >>> metric(torch.tensor([1.0, 2.0])).tolist()
@@ -70,7 +69,7 @@ def metric(slope: Tensor) -> Tensor:
 
 
 def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> Coefficients:
-    """The coefficients of eqs. 57-62.
+    """Return the coefficients of eqs. 57-62.
 
     With `N = A adj(G) A^T`:
 
@@ -80,7 +79,7 @@ def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> 
     Args:
         A: plane map, `[..., 2, 2]`.
         rest_slope: slopes of s at x, `[..., 2]`.
-        slope: slopes of s at x', `[..., 2]`; default: the same, as the paper prints it.
+        slope: slopes of s at x', `[..., 2]`; default: those at x, as the paper prints it.
 
     Returns:
         The coefficients, each `[...]`.
@@ -93,25 +92,25 @@ def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> 
 
 
 class MongeMinimumEnergy(nn.Module):
-    """The minimum-energy estimator with heights at fixed (x, y) as unknowns, harmonic material, liquid filling; for study.
+    """Minimum-energy estimator with heights at fixed (x, y) as unknowns, for harmonic material and liquid filling; for studies.
 
-    `|Q psi - gamma|^2 + s |S psi|^2` with the volume kept: Q is the derivative of the pieces' 3 x 2 maps in psi; what is of
-    second order in psi in them, the rays meeting a tilted surface, is left out. A rest load in psi is subtracted, so that zero
-    flow gives exactly psi = 0.
+    It minimises `|Q psi - gamma|^2 + s |S psi|^2` at constant volume. Q is the derivative of the pieces' 3 x 2 maps in psi.
+    Their second-order terms, from rays that meet a tilted surface, are neglected. A rest load in psi is subtracted, so that
+    zero flow gives exactly psi = 0.
 
     Args:
-        membrane: at rest.
-        elasticity: its elastic energy, "harmonic".
+        membrane: the rest surface.
+        elasticity: elastic energy of the membrane; "harmonic".
         rest_rays: rays of the vertices at rest, `(origins, directions)`, `[V, 3]` each.
-        steps: 1 is the paper's (eqs. 18, 22, about psi = 0); more repeat it about the surface found.
-        smoothing: s over the rest tension.
+        steps: number of steps; 1 is the paper's solution (eqs. 18, 22, about psi = 0), more repeat it about the surface found.
+        smoothing: s relative to the rest tension.
 
     Raises:
-        MembraneError: the surface is no graph over (x, y).
+        MembraneError: the surface is not a graph over (x, y).
 
     Limitations:
-        Where rays meet the surface between the fixed points, waves of one point's length hardly change what is observed: it
-        needs the smoother of eq. 28.
+        Where rays meet the surface between the fixed points, oscillations with the wavelength of the grid hardly change the
+        observation, so the smoother of eq. 28 is needed.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -141,8 +140,8 @@ class MongeMinimumEnergy(nn.Module):
         steepness = torch.linalg.cross(edges[..., 0, :], edges[..., 1, :]).norm(dim=-1) / 2 / footprint
         if ((footprint <= 0) | (steepness > STEEPEST)).any():
             raise MembraneError(
-                f"MongeMinimumEnergy: a piece is {float(steepness.abs().max()):.3g} times its footprint, or folded; expected a "
-                f"surface over the x, y plane, at most {STEEPEST:.3g} times: use MinimumEnergy, whose unknowns are ranges"
+                f"MongeMinimumEnergy: a triangle is {float(steepness.abs().max()):.3g} times its footprint, or folded; "
+                f"expected a graph over the x, y plane, at most {STEEPEST:.3g} times; or use MinimumEnergy, with ranges"
             )
         self.rest_plane = torch.linalg.inv(plane)
         self.rest_slope = (self.rest_plane @ edges[..., 2:]).squeeze(-1)
@@ -157,21 +156,22 @@ class MongeMinimumEnergy(nn.Module):
         self.rest_load = -Q.T @ gamma - self.rest_pressure * self.v
 
     def forward(self, origins: Tensor, directions: Tensor) -> Equilibrium:
-        """The equilibrium of one frame.
+        """Return the equilibrium of one frame.
 
         Args:
             origins: origins of the vertices' rays, `[V, 3]`.
             directions: directions of the vertices' rays, `[V, 3]`.
 
         Returns:
-            The `Equilibrium`; its vertices are the material points, where their rays meet the surface found.
+            The `Equilibrium`; its vertices are the material points, at which the rays meet the surface found.
         """
         psi, pressure, step = self.heights(origins, directions)
         x = self.material(psi, self._cells(psi, origins, directions), origins, directions)
         return Equilibrium.without_tractions(x, pressure, self.membrane.volume(self.surface(psi)), step)
 
     def heights(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """`psi` at the free points, the pressure, and the last step over the surface's size (eqs. 22, 27 with `v.psi = 0`)."""
+        """Return `psi` at the free points, the pressure, and the last step relative to the surface's size (eqs. 22, 27 with
+        `v.psi = 0`)."""
         psi, v = torch.zeros_like(self.v), self.v
         for _ in range(self.steps):
             Q, gamma = self._linearised(psi, origins, directions)
@@ -183,7 +183,7 @@ class MongeMinimumEnergy(nn.Module):
         return psi, pressure, step.abs().max() / self.membrane.size
 
     def _linearised(self, psi: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """`Q` and `gamma` of `|Q step - gamma|^2` about psi (eq. 18)."""
+        """Return `Q` and `gamma` of `|Q step - gamma|^2` about psi (eq. 18)."""
         cell = self._cells(psi, origins, directions)
 
         def maps(y: Tensor) -> Tensor:
@@ -192,27 +192,27 @@ class MongeMinimumEnergy(nn.Module):
         return torch.func.jacfwd(maps)(psi), -maps(psi)
 
     def surface(self, psi: Tensor) -> Tensor:
-        """The points `(x, y, s + psi)` over the fixed grid, `[V, 3]`."""
+        """Return the points `(x, y, s + psi)` over the fixed grid, `[V, 3]`."""
         lift = psi.new_zeros(len(self.membrane.rest)).index_add(0, self.membrane.free_vertices, psi)
         return torch.cat([self.membrane.rest[:, :2], self.membrane.rest[:, 2:] + lift[:, None]], 1)
 
     def _cells(self, psi: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
-        """The triangle of the surface that each ray meets, vertex indices `[V, 3]`."""
+        """Return the vertex indices of the triangle that each ray meets, `[V, 3]`."""
         m, n = self.membrane.grid
         now = Membrane(self.surface(psi).reshape(m, n, 3), self.membrane.fixed.numpy().reshape(m, n))
         return torch.from_numpy(now.ray_points(origins, directions).vertices)
 
     def material(self, psi: Tensor, cell: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
-        """Where the material points are: their rays and the planes of those triangles, `[V, 3]`."""
+        """Return the material points `[V, 3]`: the intersections of their rays with the planes of the triangles `cell`."""
         a, b, c = self.surface(psi)[cell].unbind(-2)
         normal = torch.linalg.cross(b - a, c - a)
         reach = ((a - origins) * normal).sum(-1, keepdim=True) / (directions * normal).sum(-1, keepdim=True)
         return torch.where(self.membrane.fixed[:, None], self.membrane.rest, origins + reach * directions)
 
     def maps(self, x: Tensor) -> Tensor:
-        """The pieces' maps into space, `[A; slope'.A] adj(G)^1/2 / det(G)^1/4`, of vertices `[V, 3]`: `[..., 3, 2]`.
+        """Return the pieces' maps into space, `[A; slope'.A] adj(G)^1/2 / det(G)^1/4`, `[..., 3, 2]`, for vertices `[V, 3]`.
 
-        Half their squares is the energy of Appendix D for each unit of `dx dy`.
+        Half their squared norm is the energy of Appendix D per unit of `dx dy`.
         """
         edges = _edges(x, self.membrane.grid)
         A = (self.rest_plane @ edges[..., :2]).mT
@@ -225,6 +225,6 @@ class MongeMinimumEnergy(nn.Module):
 
 
 def _edges(x: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Both edges from the first corner of every triangle, `[m-1, n-1, 2, 2, 3]`."""
+    """Return both edges from the first corner of every triangle, `[m-1, n-1, 2, 2, 3]`."""
     p = triangles_of(corners(x, grid))
     return p[..., 1:, :] - p[..., :1, :]

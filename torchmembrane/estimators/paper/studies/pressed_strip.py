@@ -1,7 +1,7 @@
-"""A strip pressed by discs without friction, in closed form (Appendix A's experiments).
+"""A strip pressed by discs without friction, in closed form (experiments of Appendix A).
 
-Without friction the tension, hence the stretch, is the same all along: the free parts are arcs of one radius `T / p`, tangent
-to the discs; the fluid's area fixes that radius. No grid, and the shape does not depend on the material.
+Without friction the tension, and hence the stretch, is uniform. The free parts are arcs of one radius `T / p`, tangent to the
+discs, and the fluid's area determines this radius. No grid is needed, and the shape does not depend on the material.
 """
 
 from collections.abc import Sequence
@@ -13,15 +13,15 @@ from scipy.optimize import brentq
 from ....errors import MembraneError
 from .strip import Strip
 
-FLATTEST = 1e4  # largest radius of a free arc looked for, over the strip's
+FLATTEST = 1e4  # largest radius of a free arc in the search, relative to the strip's
 
 
 class Disc(NamedTuple):
     """A cylinder seen along its axis.
 
     Attributes:
-        centre: `(x, y)`.
-        radius: 0 for a point.
+        centre: centre `(x, y)`.
+        radius: radius; 0 for a point.
 
     Example:
         >>> Disc.pressed(15.0, 0.0, 4.0, 5.0).centre
@@ -33,7 +33,7 @@ class Disc(NamedTuple):
 
     @classmethod
     def pressed(cls, strip_radius: float, angle: float, depth: float, radius: float) -> "Disc":
-        """A disc that has gone `depth` inwards since it touched the semicircle from outside, at polar `angle` (degrees)."""
+        """Return a disc that moved inwards by `depth` after touching the semicircle from outside at polar `angle`, degrees."""
         reach, phi = strip_radius + radius - depth, np.deg2rad(angle)
         return cls((reach * np.cos(phi), reach * np.sin(phi)), radius)
 
@@ -42,10 +42,10 @@ class Arc(NamedTuple):
     """Part of a circle.
 
     Attributes:
-        centre: `[2]`.
+        centre: centre of the circle, `[2]`.
         radius: radius of the circle.
-        start: angle where the arc begins, radians.
-        end: angle where it ends; on a disc it is the smaller one.
+        start: angle at which the arc starts, radians.
+        end: angle at which the arc ends, radians; on a disc it is smaller than `start`.
     """
 
     centre: np.ndarray
@@ -55,31 +55,31 @@ class Arc(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Of the arc."""
+        """Length of the arc."""
         return self.radius * abs(self.end - self.start)
 
     def points(self, share: np.ndarray) -> np.ndarray:
-        """Points `[..., 2]` at shares `[...]` of the arc's length."""
+        """Return the points `[..., 2]` at fractions `share [...]` of the arc's length."""
         angle = self.start + share * (self.end - self.start)
         return self.centre + self.radius * np.stack([np.cos(angle), np.sin(angle)], -1)
 
     @property
     def area(self) -> float:
-        """Swept from the origin: `1/2 int x dy - y dx`."""
+        """Area that the arc sweeps from the origin: `1/2 int x dy - y dx`."""
         a, b, r = self.start, self.end, self.radius
         swept = r * (b - a) + self.centre[0] * (np.sin(b) - np.sin(a)) - self.centre[1] * (np.cos(b) - np.cos(a))
         return float(r / 2 * swept)
 
 
 class PressedStrip:
-    """The semicircle around the origin (ends on the x axis), pressed by discs, its area kept.
+    """A strip that is a semicircle around the origin at rest, with ends on the x axis, pressed by discs at constant area.
 
     Args:
         radius: radius of the semicircle.
-        discs: that press it, none inside another's contact.
+        discs: the discs that press the strip, none inside another's contact.
 
     Raises:
-        MembraneError: a disc does not touch, or no free arcs of less than half a circle enclose the area.
+        MembraneError: a disc does not touch the strip, or no free arcs of less than half a circle enclose the area.
 
     Example:
         >>> lifted = PressedStrip(15.0, [Disc.pressed(15.0, 90, 4.0, 5.0)])
@@ -108,7 +108,7 @@ class PressedStrip:
         self.stretch = sum(arc.length for arc in self.arcs) / (np.pi * radius)
 
     def _arcs(self, free: float) -> list[Arc]:
-        """Free arcs and, between them, those on the discs."""
+        """Return the free arcs of radius `free` alternating with the arcs on the discs."""
         centres = [_centre(a, b, free) for a, b in zip(self.bodies, self.bodies[1:], strict=False)]
         arcs = []
         for k, centre in enumerate(centres):
@@ -123,7 +123,7 @@ class PressedStrip:
         return arcs
 
     def positions(self, angle: np.ndarray) -> np.ndarray:
-        """Where the material points at rest at polar `angle [...]` (degrees) are, `[..., 2]`."""
+        """Return the positions `[..., 2]` of the material points with polar `angle [...]` (degrees) at rest."""
         lengths = np.array([arc.length for arc in self.arcs])
         along = np.asarray(angle) / 180 * lengths.sum()
         ends = np.cumsum(lengths)
@@ -135,11 +135,11 @@ class PressedStrip:
         return place
 
     def pressure(self, strip: Strip) -> float:
-        """Of the fluid, `T / R` of the free arcs, force / length^2."""
+        """Return the pressure of the fluid, `T / R` of the free arcs, force / length^2."""
         return strip.tension(self.stretch) / self.free_radius
 
     def forces(self, strip: Strip) -> np.ndarray:
-        """Of each disc on the strip, `[I, 2]`, per length of the axis: what tension and pressure leave over."""
+        """Return the force of each disc on the strip, per length of the axis, `[I, 2]`: it balances tension and pressure."""
         tension, pressure = strip.tension(self.stretch), self.pressure(strip)
         forces = []
         for before, arc, after in zip(self.arcs[::2], self.arcs[1::2], self.arcs[2::2], strict=False):
@@ -151,17 +151,17 @@ class PressedStrip:
 
 
 def _tangent(angle: float) -> np.ndarray:
-    """Unit vector `[2]` along a circle at that angle, counterclockwise."""
+    """Return the unit vector `[2]` tangent to a circle at this angle, counterclockwise."""
     return np.array([-np.sin(angle), np.cos(angle)])
 
 
 def _gap(a: Disc, b: Disc) -> float:
-    """Distance between two centres."""
+    """Return the distance between two centres."""
     return float(np.hypot(b.centre[0] - a.centre[0], b.centre[1] - a.centre[1]))
 
 
 def _centre(a: Disc, b: Disc, free: float) -> np.ndarray:
-    """Centre of the circle of radius `free` that touches two bodies from inside the cavity, left of the way from a to b."""
+    """Return the centre of the circle of radius `free` that touches bodies a and b from inside, left of the line a b."""
     start, gap = np.asarray(a.centre), _gap(a, b)
     along = (np.asarray(b.centre) - start) / gap
     near, far = free + a.radius, free + b.radius

@@ -1,10 +1,10 @@
 """One dimension (Appendix A): a flat membrane against a convex obstacle, and a semicircle from its image.
 
-Flat (eqs. 30-31): free parts are parabolas of one curvature `p / T`, tangent to the obstacle where they meet it.
-Semicircle (eqs. 32-37): from its centre, a material point at rest at angle theta is observed at `psi = g(theta)`; its radius u
-is asked for. In theta
+Flat membrane (eqs. 30-31): the free parts are parabolas of one curvature `p / T`, tangent to the obstacle where they meet it.
+Semicircle (eqs. 32-37): a material point with the angle theta at rest is observed from the centre at `psi = g(theta)`; its
+radius u is unknown. In terms of theta
 
-    E = 1/2 int 1/r [(u g')^2 + (du/dtheta)^2] dtheta,    area 1/2 int u^2 g' dtheta kept,    u(0) = u(pi) = r
+    E = 1/2 int 1/r [(u g')^2 + (du/dtheta)^2] dtheta,    area 1/2 int u^2 g' dtheta constant,    u(0) = u(pi) = r
 
 (eqs. 35-36 print `dphi/dtheta` for `g'` and total `r^(-3/2)`; eq. 37 prints u = 0 at the ends).
 """
@@ -27,18 +27,18 @@ STEPS = 40  # of the reweighted Gauss-Newton method
 GNC_SHARE, EPS = (
     0.7,
     (5.0, 0.1),
-)  # graduated non-convexity: eps over the rest pressure, from first to last in that share of steps
+)  # graduated non-convexity: share of the steps in which eps decreases, and its first and last value over the rest pressure
 TENSILE = 100.0  # penalty of tensile normal traction
-LONGEST_STEP = 0.02  # over the strip's length
+LONGEST_STEP = 0.02  # relative to the strip's length
 
 
 class Obstacle(NamedTuple):
-    """A convex body above the line, its lowest point at height 0.
+    """A convex body above a line, with its lowest point at height 0.
 
     Attributes:
-        height: height of its lower boundary at x.
-        slope: slope of that boundary at x.
-        left: least x of the body.
+        height: function of x that gives the height of the lower boundary.
+        slope: function of x that gives the slope of this boundary.
+        left: smallest x of the body.
         right: largest x of the body.
     """
 
@@ -49,7 +49,7 @@ class Obstacle(NamedTuple):
 
     @classmethod
     def disc(cls, centre: float, radius: float) -> "Obstacle":
-        """A disc with its centre at x = `centre`."""
+        """Return a disc with its centre at x = `centre`."""
         return cls(
             lambda x: radius - np.sqrt(radius**2 - (x - centre) ** 2),
             lambda x: (x - centre) / np.sqrt(radius**2 - (x - centre) ** 2),
@@ -62,9 +62,9 @@ class FlatContact(NamedTuple):
     """A pressed flat membrane.
 
     Attributes:
-        contact: `(c1, c2)`, its ends.
-        curvature: p / T of the free parts.
-        height: height of the membrane at x.
+        contact: ends of the contact, `(c1, c2)`.
+        curvature: curvature of the free parts, p / T.
+        height: function of x that gives the height of the membrane.
     """
 
     contact: tuple[float, float]
@@ -73,18 +73,19 @@ class FlatContact(NamedTuple):
 
 
 def flat_contact(obstacle: Obstacle, span: float, depth: float) -> FlatContact:
-    """The flat membrane pressed by an obstacle, the area below it kept (eqs. 30-31).
+    """Return the flat membrane pressed by an obstacle at constant area below it (eqs. 30-31).
 
-    For a curvature of the free parts, each end of the contact is where the parabola from the rim meets the obstacle
-    tangentially; it is unique, as the tangents of a convex body meet the rim's vertical in order. The area fixes the curvature.
+    For a given curvature of the free parts, each end of the contact is the point where the parabola from the rim meets the
+    obstacle tangentially. It is unique, because the tangents of a convex body intersect the vertical line at the rim in order.
+    The area determines the curvature.
 
     Args:
-        obstacle: that presses it.
-        span: the membrane lies over `[0, span]`.
-        depth: how far the obstacle's lowest point goes down.
+        obstacle: the obstacle that presses the membrane.
+        span: length of the membrane, which lies over `[0, span]`.
+        depth: depth of the obstacle's lowest point below the flat membrane.
 
     Raises:
-        MembraneError: no positive depth, or the lowest point is not over the membrane.
+        MembraneError: the depth is not positive, or the lowest point is not over the membrane.
 
     Example:
         >>> state = flat_contact(Obstacle.disc(50.0, 20.0), 100.0, 4.0)
@@ -136,13 +137,13 @@ def flat_contact(obstacle: Obstacle, span: float, depth: float) -> FlatContact:
 
 
 class StripProfile(NamedTuple):
-    """A reconstructed strip, a semicircle at rest.
+    """A reconstructed strip that is a semicircle at rest.
 
     Attributes:
-        nodes: `[N, 2]`.
+        nodes: positions of the nodes, `[N, 2]`.
         pressure: pressure of the fluid, force / length^2.
-        traction: `[N, 2]`, contact force on the strip over length; zero for minimum energy.
-        angle: `[N]`, of the nodes at rest, radians.
+        traction: contact force on the strip per length, `[N, 2]`; zero for minimum energy.
+        angle: polar angles of the nodes at rest, radians, `[N]`.
         radius: radius of the semicircle.
     """
 
@@ -153,14 +154,14 @@ class StripProfile(NamedTuple):
     radius: float
 
     def at(self, angle: np.ndarray) -> np.ndarray:
-        """Positions `[M, 2]` of the material points at rest at `angle [M]`, radians: they move as the nodes around them."""
+        """Return the positions `[M, 2]` of the material points with `angle [M]`, radians, at rest, by linear interpolation."""
         displacement = self.nodes - around(self.radius, self.angle)
         moved = torch.from_numpy(_hat_weights(self.angle.numpy(), angle)) @ displacement
         return (around(self.radius, torch.from_numpy(angle)) + moved).numpy()
 
 
 class _Semicircle:
-    """Rest nodes at equal angles around the origin, the free ones' index, rest pressure and length."""
+    """Rest state of a semicircle: nodes at equal angles around the origin, area, length and pressure."""
 
     def __init__(self, radius: float, strip: Strip, nodes: int) -> None:
         self.radius, self.strip = radius, strip
@@ -173,19 +174,19 @@ class _Semicircle:
         self.rest_pressure = float((force * v)[1:-1].sum() / v[1:-1].square().sum())
 
     def energy(self, x: Tensor) -> Tensor:
-        """Elastic energy `[]` of the nodes at `x [N, 2]`."""
+        """Return the elastic energy `[]` of nodes at `x [N, 2]`."""
         return self.strip.energy(x, self.rest)
 
 
 class MinimumEnergyProfile(_Semicircle):
-    """Least energy on the observed rays (eqs. 35-37), area kept; Newton's method on `u`.
+    """Finds the strip with the least energy on the observed rays at constant area (eqs. 35-37), by Newton's method for `u`.
 
-    Called with markers' angles it gives a `StripProfile`; between markers `g` is a cubic spline.
+    Call it with the angles of the markers; it returns a `StripProfile`. Between markers `g` is a cubic spline.
 
     Args:
         radius: radius of the semicircle.
-        strip: its material.
-        nodes: how many.
+        strip: material of the strip.
+        nodes: number of nodes.
 
     Example:
         >>> theta = np.linspace(0.3, 2.8, 7)
@@ -195,7 +196,7 @@ class MinimumEnergyProfile(_Semicircle):
     """
 
     def __call__(self, theta: np.ndarray, psi: np.ndarray) -> StripProfile:
-        """The strip whose markers at rest angles `theta [M]` are observed at angles `psi [M]`, radians."""
+        """Return the strip whose markers with rest angles `theta [M]` are observed at angles `psi [M]`, radians."""
         ends = np.array([0.0, np.pi])
         order = np.argsort(np.append(ends, theta))
         g = CubicSpline(np.append(ends, theta)[order], np.append(ends, psi)[order])
@@ -224,9 +225,9 @@ class StripObservation(NamedTuple):
     """M markers on the strip and the rays on which they are observed.
 
     Attributes:
-        bulge: `[M, 2]`, from the chord between nodes to the marker.
-        weights: `[M, N]`, of the nodes.
-        across: `[M, 2]`, unit vectors across the rays.
+        bulge: vectors from the chord between nodes to the markers at rest, `[M, 2]`.
+        weights: interpolation weights of the nodes, `[M, N]`.
+        across: unit vectors orthogonal to the rays, `[M, 2]`.
     """
 
     bulge: Tensor
@@ -235,21 +236,21 @@ class StripObservation(NamedTuple):
 
 
 class ForceBalanceProfile(_Semicircle):
-    """Sparse inward contact forces, as `ForceBalance` in two dimensions: every node has two equations and lies on a ray.
+    """Finds sparse inward contact forces like `ForceBalance`, in the plane: every node has two equations and lies on a ray.
 
-    Solved from the rest shape.
+    The solver starts from the rest shape.
 
     Args:
         radius: radius of the semicircle.
-        strip: its material.
-        nodes: how many.
+        strip: material of the strip.
+        nodes: number of nodes.
         noise: standard deviation of a marker's angle, radians.
         sparsity: b of `beta = b / (p0 x length)`.
-        friction: kappa, penalty of tangential over normal traction.
+        friction: kappa, penalty of tangential traction relative to normal traction.
 
     Limitations:
-        Contacts closer than about a tenth of the length are not resolved. Under two points a harmonic strip is ambiguous: a
-        strip without its thickness can hide them from its centre, unless the penalty of tangential forces is very large.
+        Contacts closer than about a tenth of the length are not resolved. A harmonic strip under two points is ambiguous: they
+        may be invisible from the centre, unless the penalty of tangential forces is very large.
     """
 
     def __init__(
@@ -261,7 +262,7 @@ class ForceBalanceProfile(_Semicircle):
         self.enclosed_hessian = torch.func.hessian(area)(self.rest).reshape(2 * nodes, 2 * nodes)
 
     def __call__(self, theta: np.ndarray, psi: np.ndarray) -> StripProfile:
-        """The strip whose markers at rest angles `theta [M]` are observed at angles `psi [M]`, radians."""
+        """Return the strip whose markers with rest angles `theta [M]` are observed at angles `psi [M]`, radians."""
         weights = torch.from_numpy(_hat_weights(self.angle.numpy(), theta))
         bulge = around(self.radius, torch.from_numpy(theta)) - weights @ self.rest
         across = torch.from_numpy(np.stack([-np.sin(psi), np.cos(psi)], -1))
@@ -274,18 +275,18 @@ class ForceBalanceProfile(_Semicircle):
         return StripProfile(x, float(pressure), self._force(x, pressure) / self.share, self.angle, self.radius)
 
     def _force(self, x: Tensor, pressure: Tensor) -> Tensor:
-        """What the nodes leave out of balance, `[N, 2]`: the contact forces; zero at the ends."""
+        """Return the residual forces of the nodes, `[N, 2]`, which are the contact forces; zero at the ends."""
         force: Tensor = torch.func.grad(self.energy)(x) - pressure * torch.func.grad(area)(x)
         force[[0, -1]] = 0
         return force
 
     def _traction(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Normal (tensile positive) and tangential traction `[N]` each."""
+        """Return the normal traction (positive: tensile) and the tangential traction, `[N]` each."""
         q, n = self._force(x, pressure) / self.share, outward(x)
         return (q * n).sum(-1), q[:, 0] * n[:, 1] - q[:, 1] * n[:, 0]
 
     def _angles(self, x: Tensor, observation: StripObservation) -> tuple[Tensor, Tensor]:
-        """Angles `[M]` between rays and modelled markers, and their derivatives `[M, 2 N]`."""
+        """Return the angles `[M]` between rays and modelled markers, and their derivatives `[M, 2 N]`."""
         bulge, weights, across = observation
         marker = bulge + weights @ x
         distance = marker.norm(dim=-1, keepdim=True)
@@ -295,7 +296,7 @@ class ForceBalanceProfile(_Semicircle):
         return angle, (weights[:, :, None] * slope[:, None]).flatten(1)
 
     def _step(self, x: Tensor, pressure: Tensor, observation: StripObservation, eps: float) -> tuple[Tensor, Tensor]:
-        """One reweighted Gauss-Newton step, the area linearised, the longest move capped."""
+        """Take one reweighted Gauss-Newton step with linearised area, limiting the longest step of a node."""
         N = len(x)
         free = slice(2, 2 * N - 2)
         H = torch.func.hessian(self.energy)(x).reshape(2 * N, 2 * N) - pressure * self.enclosed_hessian
@@ -322,5 +323,5 @@ class ForceBalanceProfile(_Semicircle):
 
 
 def _hat_weights(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Linear interpolation from `nodes [N]` to `points [M]`, `[M, N]`."""
+    """Return the weights `[M, N]` of linear interpolation from `nodes [N]` to `points [M]`."""
     return np.stack([np.interp(points, nodes, row) for row in np.eye(len(nodes))], -1)
