@@ -176,7 +176,7 @@ class Table:
         return self._named(key, [self.text(key)])[0]
 
     def files(self, key: str) -> list[Path]:
-        """Return the paths of the files that `key` names, in this file's folder or below: a name, a list, or patterns with `*`."""
+        """Return the paths of the files that `key` names (a name, a list or patterns), in this file's folder or below."""
         names = self._get(key, _is_names, "a file, or a list of files, in quotes")
         return self._named(key, [names] if isinstance(names, str) else names)
 
