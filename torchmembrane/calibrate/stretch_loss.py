@@ -33,7 +33,7 @@ def continued(solutions: list[Explained], observation: Observation, progress: Pr
 
 
 def _better(own: Explained, neighbour: Explained, observation: Observation) -> Explained:
-    """Return for each press its `own` solution, or the one found from the `neighbour`'s if it converged to a lower objective."""
+    """Return for each press its `own` solution, or one found from the `neighbour`'s if that converged to a lower objective."""
     (estimator, found), (other, near) = own, neighbour
     measured = estimator.equations.bearings.measured(observation)
     start = State(
