@@ -1,1 +1,1 @@
-"""What to expect of a sensor: presses simulated on it, reconstructed from their images, and summed up in a spec sheet."""
+"""Expected accuracy of a sensor: simulated presses are reconstructed from their images and summarised in a spec sheet."""

@@ -1,4 +1,4 @@
-"""The law of contact force and pressure over depth at the top of a sensor, fitted to balls pressed in the simulator."""
+"""Contact force and pressure as functions of depth at the top of a sensor, fitted to balls pressed in the simulator."""
 
 from collections.abc import Sequence
 from math import log, pi
@@ -17,29 +17,29 @@ from ..surface.membrane import Membrane
 from .presses import followed
 
 RADII, HELD_RADII = (0.1, 0.16, 0.26), (0.13, 0.21)
-"""Radii of the balls over the surface's size: those that the law is fitted to, and those that it is tried on."""
+"""Radii of the balls over the surface's size, for fitting and for validation."""
 DEPTHS, HELD_DEPTHS = (0.02, 0.035, 0.05, 0.07, 0.1), (0.028, 0.042, 0.06, 0.085)
-"""Depths of the presses over the size, likewise."""
+"""Depths of the presses over the size, for fitting and for validation."""
 RADIUS, DEPTH = 0.16, 0.05
-"""Over the size, of the press that the law's numbers are for."""
+"""Reference radius and depth of the law, over the size."""
 FINER = 1.5
-"""Lines of the simulator's grid here over those of its own choice: the lightest press touches some ten vertices."""
+"""Grid lines over the simulator's default, so that the lightest press touches about ten vertices."""
 LEAST = 8
-"""Presses that the law's four numbers are fitted to, at least."""
+"""Smallest number of presses to which the law's four parameters are fitted."""
 TIE = 0.01
-"""Vertices whose distances from the rim differ by no more than that share are as far from it."""
+"""Relative difference up to which distances from the rim are considered equal."""
 AROUND = 0.1
-"""Over the size: the part of the rest surface whose curvatures are taken."""
+"""Radius of the part of the rest surface whose curvatures are computed, over the size."""
 
 
 class BallPress(NamedTuple):
-    """A ball pressed into the top, without friction.
+    """A frictionless press of a ball into the top of a sensor.
 
     Attributes:
         radius: radius of the ball, length unit.
-        depth: how far it has moved along the inward normal since it touched, length unit.
-        force: magnitude, force unit.
-        held_out: whether the law was not fitted to it.
+        depth: travel along the inward normal since first contact, length unit.
+        force: magnitude of the contact force, force unit.
+        held_out: whether the press is for validation, not for fitting.
     """
 
     radius: float
@@ -49,29 +49,29 @@ class BallPress(NamedTuple):
 
 
 class ContactLaw(NamedTuple):
-    """Force and pressure of a ball of radius r that is pressed d deep into the top of a sensor.
+    """Force and pressure of a ball of radius r pressed to a depth d into the top of a sensor.
 
     With s the surface's size, `a = ln(r / (RADIUS s))` and `b = ln(d / (DEPTH s))`:
 
         F(r, d) = F0 exp(m a + (n + c a) b),    p(r, d) = dF/dd sqrt(k1 k2) / (2 pi),
 
-    where k1 and k2 are `1 / r` plus the principal curvatures of the rest surface. The part of the surface that the ball
-    overlaps grows by `2 pi / sqrt(k1 k2)` for each unit of depth, so that p over the depth below the undeformed surface,
-    integrated over that part, is F. Models of compliant contact ask for such a pressure (elastic foundation, hydroelastic). The
-    true one is spread over a smaller part, more evenly.
+    where k1 and k2 are `1 / r` plus the principal curvatures of the rest surface. The area of the surface that overlaps with
+    the ball grows by `2 pi / sqrt(k1 k2)` per unit of depth, so that the integral of p, as a function of the local depth below
+    the undeformed surface, over that area is F. Compliant contact models (elastic foundation, hydroelastic) take such a
+    pressure. The true pressure acts on a smaller area and is more uniform.
 
     Attributes:
-        size: s, length unit.
-        place: `[3]`, the top: the vertex farthest from the rim; camera frame.
-        inward: `[3]`, unit, against the outward normal there.
-        curvatures: the principal ones of the rest surface there, positive where it bulges outwards, 1 / length unit.
-        reference: F0, force unit.
-        radius_exponent: m.
-        depth_exponent: n.
-        change: c, of the depth's exponent with the radius.
-        length_unit: the sensor's.
+        size: size of the surface s, length unit.
+        place: the top, which is the vertex farthest from the rim, `[3]`, camera's frame.
+        inward: unit inward normal at the top, `[3]`.
+        curvatures: principal curvatures of the rest surface there, positive for convex outward, 1 / length unit.
+        reference: reference force F0, force unit.
+        radius_exponent: exponent of the radius m.
+        depth_exponent: exponent of the depth n, at the reference radius.
+        change: change of the depth's exponent with the logarithm of the radius, c.
+        length_unit: the sensor's length unit.
         force_unit: "N" | "relative".
-        presses: that it was fitted to and tried on.
+        presses: the presses for fitting and validation.
     """
 
     size: float
@@ -87,18 +87,18 @@ class ContactLaw(NamedTuple):
     presses: Sequence[BallPress]
 
     def exponent(self, radius: float) -> float:
-        """`d ln F / d ln d` of a ball."""
+        """Return `d ln F / d ln d` for a ball of this radius."""
         return self.depth_exponent + self.change * log(radius / (RADIUS * self.size))
 
     def force(self, radius: float, depth: np.ndarray | float) -> np.ndarray:
-        """F, force unit, of the same shape as the depth."""
+        """Return the force F, force unit, with the shape of `depth`."""
         deep = np.log(np.asarray(depth) / (DEPTH * self.size))
         a = log(radius / (RADIUS * self.size))
         force: np.ndarray = self.reference * np.exp(self.radius_exponent * a + self.exponent(radius) * deep)
         return force
 
     def pressure(self, radius: float, depth: np.ndarray | float) -> np.ndarray:
-        """p, force unit / length unit squared, of the same shape as the depth."""
+        """Return the pressure p, force unit / length unit squared, with the shape of `depth`."""
         bent = np.prod([1 / radius + each for each in self.curvatures])
         if bent <= 0:
             raise MembraneError(
@@ -109,24 +109,24 @@ class ContactLaw(NamedTuple):
         return pressure
 
     def errors(self, held_out: bool = True) -> np.ndarray:
-        """What the law's force is off by, over the simulated one, of the presses held out, or of those fitted."""
+        """Return the relative errors of the law's force for the presses held out, or for those used for fitting."""
         chosen = [press for press in self.presses if press.held_out is held_out]
         return np.array([float(self.force(press.radius, press.depth)) / press.force - 1 for press in chosen])
 
 
 def contact_law(sensor: Sensor, progress: Progress = silent) -> ContactLaw:
-    """The law of a sensor: five balls pressed in the simulator, three that it is fitted to and two that it is tried on.
+    """Find the contact law of a sensor from five balls pressed in the simulator, three for fitting and two for validation.
 
     Args:
-        sensor: any.
-        progress: is told how far it is.
+        sensor: the sensor.
+        progress: called with the completed share.
 
     Raises:
         MembraneError: the sensor cannot be simulated, or too few presses can be followed.
 
     Limitations:
-        Of balls of 0.1 to 0.26 of the size, up to 0.1 of it deep and without friction, at the top: nearer the rim forces are
-        larger, and other bodies have other laws (a plate's force grows faster).
+        Valid at the top for frictionless balls of radius 0.1 to 0.26 and depths up to 0.1 of the size. Nearer the rim, forces
+        are larger, and other bodies have other laws (the force of a plate grows faster).
 
     Example:
         >>> from torchmembrane.presets import preset
@@ -159,7 +159,7 @@ def contact_law(sensor: Sensor, progress: Progress = silent) -> ContactLaw:
 
 
 def fitted(law: ContactLaw, presses: Sequence[BallPress], name: str) -> ContactLaw:
-    """The law with the numbers that fit best, by least squares of ln F, to the presses that are not held out."""
+    """Return the law fitted to the presses that are not held out, by least squares of ln F."""
     chosen = [press for press in presses if not press.held_out]
     if len(chosen) < LEAST or len({press.radius for press in chosen}) < len(RADII):
         raise MembraneError(
@@ -175,7 +175,7 @@ def fitted(law: ContactLaw, presses: Sequence[BallPress], name: str) -> ContactL
 
 
 def top_of(membrane: Membrane) -> tuple[np.ndarray, np.ndarray]:
-    """The vertex farthest from the rim, `[3]`, of several about as far the middle one, and the inward normal there."""
+    """Return the vertex farthest from the rim, `[3]` (the central one if several are tied), and the inward normal there."""
     clear = torch.cdist(membrane.rest, membrane.rest[membrane.fixed]).amin(1)
     farthest = clear > (1 - TIE) * clear.max()
     middle = membrane.rest[farthest].mean(0)
@@ -184,14 +184,14 @@ def top_of(membrane: Membrane) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curvatures_at(membrane: Membrane, place: np.ndarray, inward: np.ndarray) -> list[float]:
-    """Principal curvatures of the rest surface, the larger first, positive where it bulges outwards.
+    """Return the principal curvatures of the rest surface, the larger first, positive for convex outward.
 
-    They are those of the paraboloid that fits best to the vertices within `AROUND` of the size.
+    They are the curvatures of the paraboloid fitted to the vertices within `AROUND` of the size.
 
     Args:
-        membrane: at rest.
-        place: `[3]`, on the surface.
-        inward: `[3]`, unit normal.
+        membrane: the membrane at rest.
+        place: point on the surface, `[3]`.
+        inward: unit inward normal there, `[3]`.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap

@@ -1,4 +1,4 @@
-"""A file that keeps finished series of trials until all are finished, so that an interrupted spec sheet can be resumed."""
+"""A file that stores finished series of trials until all are finished, so that an interrupted spec sheet can be resumed."""
 
 import hashlib
 import json
@@ -17,11 +17,11 @@ EXPECTED = "series of trials as check --accuracy keeps them"
 
 
 class FinishedSeries(NamedTuple):
-    """The file that keeps finished series, and the series that it held when it was opened.
+    """The file that stores finished series, and their outcomes.
 
     Attributes:
-        path: the file; it need not exist.
-        outcomes: outcomes of the finished series, by their number.
+        path: path of the file, which need not exist.
+        outcomes: outcomes of the finished series, by number.
     """
 
     path: Path
@@ -31,15 +31,15 @@ class FinishedSeries(NamedTuple):
     def resumed(
         cls, folder: Path, version: str, sensor: Sensor, seed: int, noise: float | None, effort: Effort
     ) -> "FinishedSeries":
-        """The file of one spec sheet: another version, sensor, seed, noise or effort has another file.
+        """Open the file of one spec sheet; its name depends on version, sensor, seed, noise and effort.
 
         Args:
-            folder: where the file is.
+            folder: folder of the file.
             version: version of the package.
             sensor: the sensor.
             seed: seed of the trials.
             noise: noise of the images, dB; None: that of the rest image.
-            effort: how much is tried.
+            effort: number of trials.
 
         Raises:
             MembraneError: the file cannot be read.
@@ -49,11 +49,11 @@ class FinishedSeries(NamedTuple):
         return cls(path, _read(path) if path.exists() else {})
 
     def keep(self, number: int, outcome: Outcome) -> None:
-        """Write the file anew with one more series, atomically.
+        """Add the outcome of one series and rewrite the file atomically.
 
         Args:
             number: number of the series.
-            outcome: what its trials gave.
+            outcome: outcome of the series.
         """
         self.outcomes[number] = outcome
         try:
@@ -63,7 +63,7 @@ class FinishedSeries(NamedTuple):
             warn_user(f"{error}; an interruption loses what is done")
 
     def remove(self) -> None:
-        """Remove the file, as the sheet is done."""
+        """Remove the file after the spec sheet is complete."""
         self.path.unlink(missing_ok=True)
 
 

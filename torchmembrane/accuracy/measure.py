@@ -1,4 +1,4 @@
-"""A sensor's spec sheet: presses simulated on it, reconstructed from their images, summed up."""
+"""Measurement of a sensor's spec sheet from simulated presses, reconstructed from their images."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -15,14 +15,14 @@ from .rig import Rig, image_noise
 from .spec_sheet import Effort, Outcome, SpecSheet
 
 NEAR = 0.05
-"""Over the size: within it, or within the markers' spacing, of where it is a contact counts as found."""
+"""Largest position error of a contact that counts as found, over the size; at least the markers' spacing is allowed."""
 REST, STROKE, PAIR = "frames at rest", "stroke", "pairs"
 WORK = {REST: 0.5, STROKE: 1.0, PAIR: 0.5}
-"""Time that a series takes over that of a stroke, roughly: frames at rest are not simulated, pairs are half as many."""
+"""Approximate time of a series over that of a stroke: frames at rest need no simulated press, pairs are half as many."""
 
 
 class Series(NamedTuple):
-    """Trials that one process runs one after another: frames at rest, a stroke, or the pairs of a direction."""
+    """Trials that one process runs sequentially: frames at rest, a stroke, or the pairs of one direction."""
 
     kind: str
     number: int
@@ -40,28 +40,29 @@ def spec_sheet(
     finished: FinishedSeries | None = None,
     progress: Progress = silent,
 ) -> SpecSheet:
-    """Measure what to expect of a sensor, by trials on a simulated one, through images.
+    """Measure the accuracy of a sensor by trials on simulated images of it.
 
-    Noise at rest, the lightest touch found, errors by force, the distance that resolves two contacts, the deepest press.
+    The trials give the noise at rest, the lightest detectable touch, errors by force, the smallest distance at which two
+    contacts are resolved, and the deepest press that is reconstructed.
 
     Args:
         sensor: the sensor.
-        seed: seed of presses and noise; the same gives the same.
-        noise: noise of the images, white over its standard deviation, dB; default: as in the rest image (`image_noise`).
-        effort: how much is tried.
-        jobs: processes.
-        finished: series that an interrupted call of the same arguments has finished, which keeps those of this call as well.
-        progress: is told how far it is.
+        seed: seed of presses and noise, for reproducible results.
+        noise: noise of the images, white level over standard deviation, dB; default: as in the rest image (`image_noise`).
+        effort: number of trials.
+        jobs: number of processes.
+        finished: series finished by an interrupted call with the same arguments; series of this call are added.
+        progress: called with the completed share.
 
     Returns:
-        The `SpecSheet`. Trials that cannot be simulated are left out, and said.
+        The `SpecSheet`. Trials that cannot be simulated are left out and listed in `left_out`.
 
     Raises:
-        MembraneError: the sensor cannot be simulated or reconstructed, or none of the strokes can.
+        MembraneError: the sensor cannot be simulated or reconstructed, or no stroke can be simulated.
 
     Limitations:
-        Of a sensor that is as its file says: errors of its calibration, its material and its light come on top. Bodies are
-        balls and boxes, every second with friction.
+        The sensor is assumed to match its file: errors of calibration, material and illumination add to these errors. The
+        indenters are balls and boxes, every second one with friction.
 
     Example:
         >>> from torchmembrane.presets import preset
@@ -109,7 +110,7 @@ def spec_sheet(
 def _outcomes(
     rig: Rig, series: Sequence[Series], jobs: int, finished: FinishedSeries | None, progress: Progress
 ) -> list[Outcome]:
-    """The outcomes of all series in their order: those finished earlier are read, the others are computed now."""
+    """Return the outcomes of all series in order; series finished earlier are read, the others are computed."""
     outcomes = dict(finished.outcomes) if finished else {}
     waiting = [(k, series[k]) for k in range(len(series)) if k not in outcomes]
     progress(_share_done(series, outcomes), f"{len(waiting)} series of presses")
@@ -122,12 +123,12 @@ def _outcomes(
 
 
 def _share_done(series: Sequence[Series], done: Iterable[int]) -> float:
-    """The share of the work in the series of these numbers."""
+    """Return the share of the work that the series `done` have."""
     return sum(WORK[series[k].kind] for k in done) / sum(WORK[each.kind] for each in series)
 
 
 def outcome_of(rig: Rig, series: Series) -> Outcome:
-    """The outcome of a series of trials on this rig."""
+    """Run a series of trials on this rig and return its outcome."""
     kind, number, effort, seed = series
     try:
         if kind == REST:
@@ -142,7 +143,7 @@ def outcome_of(rig: Rig, series: Series) -> Outcome:
 
 
 def _in_processes(rig: Rig, series: Sequence[tuple[int, Series]], jobs: int) -> Iterator[tuple[int, Outcome]]:
-    """Numbers of series and their outcomes, as they are finished."""
+    """Yield the number and the outcome of each series as it is finished."""
     jobs = min(jobs, len(series))
     if jobs <= 1:
         yield from ((k, outcome_of(rig, each)) for k, each in series)
@@ -155,7 +156,7 @@ _rig: Rig
 
 
 def _begin(path: Path) -> None:
-    """Start a worker process: what `_work` needs, once."""
+    """Initialise a worker process with the rig that `_work` needs."""
     global _rig
     _rig = Rig(*begin_worker(path))
 

@@ -1,4 +1,4 @@
-"""Which presses are tried on a sensor: strokes from the first touch on, pairs of balls ever nearer each other."""
+"""Presses of the trials: strokes of increasing depth, and pairs of balls at decreasing distance."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -17,24 +17,24 @@ BODIES = ("sphere", "sphere", "box")
 FRICTIONS = (0.0, 0.4)
 DEEPEST = 0.3  # travel of a stroke, over the surface's size
 INCREMENT = 0.03  # longest step, over the size
-BALL, PUSHED = 0.06, 0.05  # radius of the balls of a pair, and how deep they press
-WIDEST, NEARER = 0.55, 0.8  # distance of the first pair, and of each next one over that before
-LINES = 8  # drawn for a direction, of which that with room for most pairs is taken
-MIDDLE = 0.6  # how far a pair's middle is from the rim at least, over the largest distance from it
-IN_VIEW = 0.02  # of the image's sides, how far from its border a place has to be seen
-STEPS = 100  # of Newton's method at one pose, after which a stroke is not followed further
+BALL, PUSHED = 0.06, 0.05  # radius of the balls of a pair, and their depth, over the size
+WIDEST, NEARER = 0.55, 0.8  # distance of the first pair, over the size; ratio of successive distances
+LINES = 8  # random lines per direction, of which the one with room for most pairs is used
+MIDDLE = 0.6  # smallest distance of a pair's midpoint from the rim, over the largest possible one
+IN_VIEW = 0.02  # smallest distance of a contact from the image's border, over the image's sides
+STEPS = 100  # Newton steps at one pose after which a stroke is abandoned
 FAR_FROM_A_RIM = "expected a membrane of which the camera sees a part off the rim: check the camera and the rest surface"
 
 
 class PairPress(NamedTuple):
-    """Two balls at once, in equilibrium; `distance` is between the true contacts' centres."""
+    """An equilibrium with two balls; `distance` is the distance between the centres of the true contacts, length unit."""
 
     state: Press
     distance: float
 
 
 def in_view(simulator: Simulator) -> np.ndarray:
-    """Which vertices of the simulator's grid its camera sees well at rest, `[V]` bool."""
+    """Return which vertices of the simulator's grid are well inside the image at rest, `[V]` bool."""
     camera = simulator.sensor.camera
     pixels, size = camera.point_to_pixel(simulator.membrane.rest).numpy(), np.array(camera.image_size)
     with np.errstate(invalid="ignore"):
@@ -43,9 +43,9 @@ def in_view(simulator: Simulator) -> np.ndarray:
 
 
 def shares(frames: int, offset: float) -> list[float]:
-    """Depths of a stroke's frames over its last one's: `((k + offset) / (frames + offset))^2`, k from 1 on.
+    """Return the depths of a stroke's frames over the last one's: `((k + offset) / (frames + offset))^2`, k = 1, 2, ...
 
-    Strokes with other offsets in 0..1 have other light touches between them.
+    Different offsets in 0..1 give different light touches.
 
     Example:
         >>> shares(2, 0.0), [round(share, 2) for share in shares(2, 0.5)]
@@ -55,20 +55,20 @@ def shares(frames: int, offset: float) -> list[float]:
 
 
 def stroke_states(simulator: Simulator, number: int, frames: int, offset: float, seed: int) -> list[Press]:
-    """Equilibria along one stroke from the first touch on, their depth growing quadratically.
+    """Simulate one stroke from first contact, with quadratically increasing depths.
 
     Args:
-        simulator: the sensor's.
-        number: number of the stroke, which says what presses, where and with what friction.
-        frames: how many, at the `shares` of `DEEPEST`.
+        simulator: the sensor's simulator.
+        number: number of the stroke, which determines indenter, place and friction.
+        frames: number of frames, at the `shares` of the depth `DEEPEST`.
         offset: offset of the shares, 0..1.
         seed: seed of all strokes.
 
     Returns:
-        As many as the membrane can follow, without those before the first vertex is touched.
+        The equilibria that can be simulated, without those before any vertex is touched.
 
     Raises:
-        MembraneError: nothing can be pressed, or none of these can be followed.
+        MembraneError: no press is possible, or no equilibrium with contact was found.
     """
     rng = np.random.default_rng([seed, 1, number])
     plan = Plan((BODIES[number % len(BODIES)],), FRICTIONS[number % len(FRICTIONS)], seed)
@@ -83,19 +83,19 @@ def stroke_states(simulator: Simulator, number: int, frames: int, offset: float,
 
 
 def pair_states(simulator: Simulator, number: int, count: int, seed: int) -> list[PairPress]:
-    """Two balls side by side, ever nearer each other.
+    """Simulate presses of two balls at decreasing distance.
 
     Args:
-        simulator: the sensor's.
-        number: number of the direction, in which they lie from each other.
-        count: how many distances are tried, from `WIDEST` x size on, each `NEARER` of the one before.
+        simulator: the sensor's simulator.
+        number: number of the direction of the line on which the balls lie.
+        count: number of distances, starting at `WIDEST` x size, each `NEARER` times the one before.
         seed: seed of all directions.
 
     Returns:
-        Those that have room off the rim and in view, and that the membrane can follow.
+        The pairs that are away from the rim, in view, and can be simulated.
 
     Raises:
-        MembraneError: nothing can be pressed, or there are none of these.
+        MembraneError: there is no place for two balls, or no pair can be simulated.
     """
     membrane, rng = simulator.membrane, np.random.default_rng([seed, 2, number])
     size, clear, seen = membrane.size, _clear_of_rim(simulator), in_view(simulator)
@@ -121,7 +121,7 @@ def pair_states(simulator: Simulator, number: int, count: int, seed: int) -> lis
 
 
 def _pair(simulator: Simulator, places: np.ndarray, ways: np.ndarray) -> list[PairPress]:
-    """Two balls pressed in at `places [2, 3]` along `ways [2, 3]`; none where they cannot be."""
+    """Press two balls at `places [2, 3]` along `ways [2, 3]`; return an empty list if that is not possible."""
     size = simulator.membrane.size
     try:
         strokes = [
@@ -137,8 +137,7 @@ def _pair(simulator: Simulator, places: np.ndarray, ways: np.ndarray) -> list[Pa
 
 
 def followed(simulator: Simulator, paths: Sequence[Sequence], friction: float) -> tuple[list[Press], str]:
-    """The equilibria at the poses after the first one, as far as the membrane can follow, and the reason why it cannot follow
-    further."""
+    """Return the equilibria at the poses after the first one, up to a failure, and the failure's reason (empty if none)."""
     states: list[Press] = []
     options = dict(friction=friction, increment=INCREMENT * simulator.membrane.size, **simulator.cavity)
     try:
@@ -154,6 +153,6 @@ def followed(simulator: Simulator, paths: Sequence[Sequence], friction: float) -
 
 
 def _clear_of_rim(simulator: Simulator) -> np.ndarray:
-    """Distance of every vertex from the rim, `[V]`."""
+    """Return the distance of each vertex from the rim, `[V]`."""
     X = simulator.membrane.rest
     return torch.cdist(X, X[simulator.membrane.fixed]).amin(1).numpy()

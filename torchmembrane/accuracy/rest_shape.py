@@ -1,4 +1,4 @@
-"""Whether a rest surface can be in equilibrium: its residual forces, and the nearest sheet that is inflated in the same rim."""
+"""Check whether a rest surface can be in equilibrium: its residual forces, and the nearest inflated sheet in the same rim."""
 
 from typing import NamedTuple
 
@@ -13,20 +13,20 @@ from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 
-RAISED = 1.02  # of a height, to see how the sheet follows it
-LINES = 17  # of the sheet's grid: its shape is then right to some thousandths of its height
+RAISED = 1.02  # factor of the height for the finite difference of the sheet's shape
+LINES = 17  # of the sheet's grid; its shape is then accurate to some thousandths of its height
 
 
 class NearestSheet(NamedTuple):
-    """The nearest rest surface that is a sheet of the same rubber, inflated in the same rim.
+    """The nearest rest surface that is an inflated sheet of the same material in the same rim.
 
     Attributes:
-        height: height of its highest point above the rim's plane.
-        distance: rms of the given surface's distance from it, length unit.
-        most: the largest.
-        pressure: that holds it, force / length^2.
-        stretch: stretch of the sheet in its rim, before it is blown up.
-        least: mean stretch that blowing up alone gives.
+        height: height of its highest point above the rim's plane, length unit.
+        distance: rms distance of the given surface from it, length unit.
+        most: largest distance of the given surface from it, length unit.
+        pressure: its equilibrium pressure, force / length^2.
+        stretch: stretch of the sheet in its rim, before inflation.
+        least: mean stretch due to inflation alone.
     """
 
     height: float
@@ -41,10 +41,10 @@ class RestShape(NamedTuple):
     """The result of checking a rest surface.
 
     Attributes:
-        pressure: that the fluid has over its surroundings by the model, force / length^2.
-        left_over: rms over the surface of the forces per area that neither tension nor pressure balances, over the pressure;
-            a fixed load takes them up.
-        nearest: None of a surface that is such a sheet, or in whose rim there is none.
+        pressure: overpressure of the fluid according to the model, force / length^2.
+        left_over: rms of the residual force per area that tension and pressure do not balance, over the pressure; the model
+            balances it with a fixed load.
+        nearest: the nearest inflated sheet; None if the surface is such a sheet, or there is none in its rim.
     """
 
     pressure: float
@@ -56,7 +56,7 @@ def rest_shape(sensor: Sensor) -> RestShape:
     """Compare a sensor's rest surface with surfaces that can be in equilibrium.
 
     Args:
-        sensor: any.
+        sensor: the sensor.
 
     Returns:
         The `RestShape`.
@@ -93,7 +93,7 @@ def _nearest(sensor: Sensor) -> NearestSheet | None:
     slope = _above(high.vertices, X) - off
     share = -float((slope * off).sum() / (slope * slope).sum())
     distance = _above(low.vertices + share * (high.vertices - low.vertices), X)
-    modulus = material.modulus * least**2  # the sheet is as much thicker as it is smaller
+    modulus = material.modulus * least**2  # the sheet is thicker by the ratio of areas
     return NearestSheet(
         height=low.height + share * (high.height - low.height),
         distance=float(np.sqrt((distance**2).mean())),
@@ -105,7 +105,7 @@ def _nearest(sensor: Sensor) -> NearestSheet | None:
 
 
 def _above(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Signed distances of points `[N, 3]` from a grid's surface, positive outside, `[N]`."""
+    """Return the signed distances of points `[N, 3]` from a grid's surface, `[N]`, positive outside."""
     surface = Membrane(vertices)
     near = surface.closest_points(points)
     closest, normals = (

@@ -1,4 +1,4 @@
-"""A sensor in silico and its reconstructor: presses to images, images to results, results beside what is true."""
+"""A simulated sensor and its reconstructor: presses to images, images to results, and results compared with the truth."""
 
 import warnings
 from collections.abc import Sequence
@@ -20,14 +20,15 @@ from ..simulate.simulator import Simulator
 from .presses import PairPress
 from .spec_sheet import PairTrial, PressTrial, RestTrial
 
-USUAL_NOISE = 40.0  # dB, where a rest image does not say
-QUIETEST = 45.0  # dB, of a single frame, also where a rest image averages many
+USUAL_NOISE = 40.0  # dB, if a rest image does not show it
+QUIETEST = 45.0  # dB, lowest noise assumed for a frame, as a rest image may be a mean of many frames
 
 
 def image_noise(sensor: Sensor) -> float:
-    """Noise of a sensor's images: white over its standard deviation, dB.
+    """Return the noise of a sensor's images, white level over standard deviation, dB.
 
-    As in its rest image, `QUIETEST` at most; `USUAL_NOISE` without one, and for texture, whose grain looks like noise.
+    It is estimated from the rest image and limited to `QUIETEST`. Without a rest image, and for texture, whose grain resembles
+    noise, it is `USUAL_NOISE`.
 
     Example:
         >>> from torchmembrane.presets import preset
@@ -42,19 +43,19 @@ def image_noise(sensor: Sensor) -> float:
 
 
 class Rig:
-    """What trials of one sensor need, of one camera or of several views.
+    """Simulator and reconstructor for the trials of one sensor, with one camera or several views.
 
-    The simulator stands on a grid of its own, finer than the reconstructor's, with no line in common but the rim. The rest
-    image is simulated as the presses are, in the same light.
+    The simulator's grid is finer than the reconstructor's and shares no line with it except the rim. The rest image is
+    simulated like the presses, with the same illumination.
 
     Args:
         sensor: the sensor.
         noise: noise of all images, dB below white.
 
     Attributes:
-        simulator: that presses it and takes the images.
-        reconstructor: that does not know what was pressed.
-        seen: `[V]` bool, which of the reconstructor's vertices a camera sees at rest.
+        simulator: the simulator, which presses the membrane and renders images.
+        reconstructor: the reconstructor, which has no access to the true presses.
+        seen: which of the reconstructor's vertices any camera sees at rest, `[V]` bool.
 
     Raises:
         MembraneError: the sensor cannot be simulated, or reconstructed.
@@ -64,12 +65,12 @@ class Rig:
         self.simulator = Simulator(sensor, appearance=Appearance(noise=noise))
         at_rest = self.simulator.at_rest()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is to be said of the sensor, its own reconstructor says
+            warnings.simplefilter("ignore")  # a user's reconstructor of the sensor issues these warnings
             self.reconstructor = Reconstructor(replace(at_rest, range=UNLIMITED))
         self.seen = self._in_image()
 
     def rest_trials(self, frames: int, seed: int) -> list[RestTrial]:
-        """So many frames at rest, each with noise of its own."""
+        """Reconstruct frames at rest with independent noise."""
         rng = np.random.default_rng([seed, 0])
         if self.simulator.sensor.views:
             at_rest = self.simulator.membrane.rest
@@ -81,12 +82,12 @@ class Rig:
         return rest_trials(result, self.seen)
 
     def press_trials(self, states: Sequence[Press], stroke: int, seed: int) -> list[PressTrial]:
-        """One stroke's equilibria, photographed, reconstructed and compared."""
+        """Render the equilibria of one stroke, reconstruct them and compare the results with the truth."""
         result = self._reconstructed(states, np.random.default_rng([seed, 3, stroke]))
         return press_trials(stroke, states, self._displacement(states), result, self._normals(), self.seen, self._found())
 
     def pair_trials(self, pairs: Sequence[PairPress], direction: int, seed: int) -> list[PairTrial]:
-        """One direction's pairs, photographed, reconstructed and compared."""
+        """Render the pairs of one direction, reconstruct them and compare the results with the truth."""
         result = self._reconstructed([pair.state for pair in pairs], np.random.default_rng([seed, 4, direction]))
         return pair_trials(direction, pairs, result)
 
@@ -94,14 +95,14 @@ class Rig:
         return self._found_in([self.simulator.images(state.vertices, rng) for state in states])
 
     def _found_in(self, frames: Sequence[Sequence[np.ndarray]]) -> Reconstruction:
-        """What is found in frames, of an image each or one of each view that has its own."""
+        """Reconstruct frames, each of which is one image, or one image per view."""
         images = [np.stack(of_view) for of_view in zip(*frames, strict=True)]
         with torch.no_grad():
             found: Reconstruction = self.reconstructor(images if self.simulator.sensor.views_apart else images[0])
         return found
 
     def _displacement(self, states: Sequence[Press]) -> Tensor:
-        """The true displacement `[F, V, 3]` at the reconstructor's vertices."""
+        """Return the true displacements at the reconstructor's vertices, `[F, V, 3]`."""
         rest = self.reconstructor.sensor.membrane.rest.double()
         return carried(torch.stack([state.vertices for state in states]), self.simulator.membrane, rest) - rest
 
@@ -109,7 +110,7 @@ class Rig:
         return self.reconstructor.sensor.membrane.rest_normals.double()
 
     def _found(self) -> Tensor:
-        """`[D]` bool, which markers are found at rest, by any view."""
+        """Return which markers any view finds at rest, `[D]` bool."""
         seen = self.reconstructor.observer.seen_at_rest
         return seen.view(-1, len(self.reconstructor.rest_markers)).any(0)
 
@@ -127,11 +128,11 @@ def _within(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
 
 
 def rest_trials(result: Reconstruction, seen: Tensor) -> list[RestTrial]:
-    """What frames at rest give.
+    """Evaluate frames at rest.
 
     Args:
-        result: result of B frames.
-        seen: `[V]` bool, the vertices in view.
+        result: reconstruction of B frames.
+        seen: mask of the vertices in view, `[V]` bool.
     """
     rms = result.displacement[:, seen].double().square().sum(-1).mean(-1).sqrt()
     contacts = result.contact_points[..., 0].isfinite().sum(-1)
@@ -148,16 +149,16 @@ def press_trials(
     seen: Tensor,
     found: Tensor,
 ) -> list[PressTrial]:
-    """What the results of one stroke are off by.
+    """Compute the errors of the results of one stroke.
 
     Args:
-        stroke: its number.
-        states: the B true equilibria, of one indenter.
-        displacement: true, at the result's vertices, `[B, V, 3]`.
-        result: result of the B images.
-        normals: outward at rest, `[V, 3]`.
-        seen: `[V]` bool, the vertices in view.
-        found: `[D]` bool, the markers found at rest.
+        stroke: number of the stroke.
+        states: the B true equilibria, with one indenter.
+        displacement: true displacement of the result's vertices, `[B, V, 3]`.
+        result: reconstruction of the B images.
+        normals: outward normals at rest, `[V, 3]`.
+        seen: mask of the vertices in view, `[V]` bool.
+        found: mask of the markers found at rest, `[D]` bool.
     """
     true_force, centre = (torch.stack(values) for values in zip(*((s.force, s.contact_points[0]) for s in states), strict=True))
     size, off = torch.linalg.vector_norm(true_force, dim=-1), result.force.double() - true_force
@@ -165,7 +166,7 @@ def press_trials(
     depth, deep = (-(values * normals[seen]).sum(-1).amin(-1) for values in (u, estimate))
     miss = torch.linalg.vector_norm((estimate - u).flatten(1), dim=-1) / torch.linalg.vector_norm(u.flatten(1), dim=-1)
     place = torch.linalg.vector_norm(result.contact_points[:, 0].double() - centre, dim=-1)
-    confidence = result.confidence.reshape(len(size), -1, len(found)).amax(1)  # of the view that is surest
+    confidence = result.confidence.reshape(len(size), -1, len(found)).amax(1)  # of the view with the highest confidence
     lost = (confidence[:, found] <= 0).double().mean(-1)
     columns = (
         size,
@@ -183,12 +184,12 @@ def press_trials(
 
 
 def pair_trials(direction: int, pairs: Sequence[PairPress], result: Reconstruction) -> list[PairTrial]:
-    """Which pairs are resolved.
+    """Determine which pairs are resolved.
 
     Args:
-        direction: its number.
-        pairs: B of them.
-        result: result of the B images.
+        direction: number of the direction.
+        pairs: the B pairs.
+        result: reconstruction of the B images.
     """
     trials = []
     for pair, points, status in zip(pairs, result.contact_points.double(), result.status, strict=True):

@@ -1,6 +1,6 @@
-"""The contents of a sensor's spec sheet: the errors of its reconstructions, trial by trial and summarised.
+"""The contents of a sensor's spec sheet: errors of its reconstructions, for each trial and summarised.
 
-Lengths are in the sensor's unit, forces and pressures in its force unit; errors over the truth have none.
+Lengths are in the sensor's length unit, forces and pressures in its force unit; relative errors have no unit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,13 +10,13 @@ from ..results.status import Status
 from ..sensor.working_range import WorkingRange
 
 CLOSE = 0.25
-"""Largest error of a surface, over its displacement, up to which a press counts as reconstructed."""
+"""Largest relative error of the surface of a press that counts as reconstructed."""
 LOST = 0.05
-"""Largest share of the markers found at rest that a press may lose and count so."""
+"""Largest share of the markers found at rest that are lost in a press that counts as reconstructed."""
 
 
 class Spread(NamedTuple):
-    """Median and 90 % quantile of some values; NaN where there are none."""
+    """Median and 90 % quantile of values; NaN if there are none."""
 
     median: float
     most: float
@@ -26,17 +26,17 @@ class PressTrial(NamedTuple):
     """One frame of a stroke: the truth and the errors of the reconstruction.
 
     Attributes:
-        stroke: number of the stroke that it belongs to.
+        stroke: number of the stroke.
         force: magnitude of the true force.
-        depth: true depth, the deepest displacement along the inward normal.
-        force_error: error of the force as a vector, over the true one's magnitude.
-        depth_error: absolute, of the depth.
-        place_error: distance from the centre of the true contact to the strongest one reported; infinite where none is.
-        surface_error: rms over the part in view, over the rms of the true displacement there.
+        depth: true depth, the largest displacement along the inward normal.
+        force_error: magnitude of the force's vector error, over the magnitude of the true force.
+        depth_error: absolute error of the depth.
+        place_error: distance of the strongest reported contact from the centre of the true one; infinite if none is reported.
+        surface_error: rms error of the displacement in view, over the rms of the true displacement there.
         lost: share of the markers found at rest that are lost.
-        at_rim: whether a contact is said to reach the rim, its force to be a lower bound.
+        at_rim: whether a contact is reported to reach the rim, so that its force is a lower bound.
         status: a `Status`.
-        turn: by which the surface found turns, degrees, as `WorkingRange` has it.
+        turn: rotation of the reconstructed surface, degrees, as defined in `WorkingRange`.
     """
 
     stroke: int
@@ -53,21 +53,21 @@ class PressTrial(NamedTuple):
 
     @property
     def relied_on(self) -> bool:
-        """Whether the result reports that its force can be relied on: status ok and no contact at the rim."""
+        """Whether the result claims a reliable force: status ok and no contact at the rim."""
         return self.status == Status.OK and not self.at_rim
 
     @property
     def is_wrong(self) -> bool:
-        """Whether surface or force are off by more than `CLOSE`; a force that is reported as a lower bound does not count."""
+        """Whether the relative error of surface or force exceeds `CLOSE`; forces reported as lower bounds do not count."""
         return self.surface_error > CLOSE or (self.force_error > CLOSE and not self.at_rim)
 
     def is_found(self, near: float) -> bool:
-        """Whether the strongest contact is reported within `near` (length) of where it is, with status ok."""
+        """Return whether status is ok and the strongest contact is reported within `near` (length unit) of the true one."""
         return self.status == Status.OK and self.place_error < near
 
     @property
     def failure(self) -> str:
-        """The reason why the frame does not count as reconstructed; empty if it does."""
+        """The reason why the frame does not count as reconstructed; empty if it does count."""
         if self.status != Status.OK:
             return Status(self.status).name.lower().replace("_", " ")
         if self.lost > LOST:
@@ -76,12 +76,12 @@ class PressTrial(NamedTuple):
 
 
 class PairTrial(NamedTuple):
-    """A pair of simultaneous touches.
+    """A pair of simultaneous contacts.
 
     Attributes:
-        direction: number of the line on which pairs are moved together.
-        distance: between the centres of the two true contacts.
-        told: whether two contacts are reported, each within half of the distance of one of the true ones, with status ok.
+        direction: number of the direction in which the pairs lie.
+        distance: distance between the centres of the two true contacts.
+        told: whether the contacts are resolved: status is ok and a contact is reported within half the distance of each.
     """
 
     direction: int
@@ -93,10 +93,10 @@ class RestTrial(NamedTuple):
     """One frame at rest.
 
     Attributes:
-        surface: rms displacement found, over the part in view.
-        force: magnitude found.
-        pressure: magnitude of the change found.
-        contacts: how many are reported.
+        surface: rms of the reconstructed displacement in view.
+        force: magnitude of the reconstructed force.
+        pressure: magnitude of the reconstructed pressure change.
+        contacts: number of reported contacts.
         status: a `Status`.
     """
 
@@ -108,14 +108,14 @@ class RestTrial(NamedTuple):
 
 
 class Effort(NamedTuple):
-    """The extent of the trials.
+    """The number of trials.
 
     Attributes:
-        strokes: from the first touch on, towards random places.
+        strokes: number of strokes at random places.
         frames: number of frames of each stroke.
-        directions: in which two touches are moved together.
-        distances: between them that are tried.
-        rest: frames at rest.
+        directions: number of directions in which pairs of contacts are tried.
+        distances: number of distances between the contacts of a pair, for each direction.
+        rest: number of frames at rest.
     """
 
     strokes: int = 8
@@ -126,7 +126,7 @@ class Effort(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The outcome of one series of trials; `reason` says why it could not be simulated."""
+    """The outcome of one series of trials; `reason` says why it could not be simulated (empty if it could)."""
 
     rest: Sequence[RestTrial] = ()
     presses: Sequence[PressTrial] = ()
@@ -135,15 +135,15 @@ class Outcome(NamedTuple):
 
 
 class RestFloor(NamedTuple):
-    """What is found in frames at rest, where nothing should be found.
+    """Spurious results in frames at rest.
 
     Attributes:
-        frames: how many.
-        not_ok: number of them with another status than ok; not in the spreads.
-        touched: number of them with a contact reported.
+        frames: number of frames.
+        not_ok: number of frames with a status other than ok, which are excluded from the following figures.
+        touched: number of frames with a reported contact.
         surface: rms displacement.
-        force: magnitude.
-        pressure: magnitude of the change.
+        force: magnitude of the force.
+        pressure: magnitude of the pressure change.
     """
 
     frames: int
@@ -155,13 +155,13 @@ class RestFloor(NamedTuple):
 
 
 class LightestTouch(NamedTuple):
-    """The force and depth from which on a growing press is found.
+    """The force and depth at which an increasing press is first found.
 
     Attributes:
-        strokes: in how many strokes.
-        found: in how many of them the contact is found at all.
-        force: force of the first frame found, over those strokes.
-        depth: depth of the same frame.
+        strokes: number of strokes.
+        found: number of strokes in which the contact is found at all.
+        force: force at the first frame in which it is found, over those strokes.
+        depth: depth at the same frame.
     """
 
     strokes: int
@@ -174,14 +174,14 @@ class Band(NamedTuple):
     """Errors of presses whose true force is above `low` and up to `high`.
 
     Attributes:
-        low: force.
-        high: force.
-        presses: how many.
-        relied_on: share of them with status ok and no contact at the rim; the errors are theirs.
-        found: share of those whose contact is found.
+        low: lower bound of the force.
+        high: upper bound of the force.
+        presses: number of presses.
+        relied_on: share of presses with status ok and no contact at the rim; the following figures are for these.
+        found: share of these whose contact is found.
         force: relative error of the force.
         depth: error of the depth.
-        place: error of the contact's place, where one is reported.
+        place: error of the contact's position, if a contact is reported.
     """
 
     low: float
@@ -195,12 +195,12 @@ class Band(NamedTuple):
 
 
 class ClosestPair(NamedTuple):
-    """The distance from which on two touches are resolved.
+    """The smallest distance at which two contacts are resolved.
 
     Attributes:
-        directions: in how many directions pairs were moved together.
-        told: in how many of them the widest pair is resolved.
-        distance: the smallest at which this and every wider pair is resolved, over those.
+        directions: number of directions in which pairs were tried.
+        told: number of directions in which the widest pair is resolved.
+        distance: smallest distance at which this and every wider pair is resolved, over those directions.
         nearest: the smallest distance tried.
         widest: the largest distance tried.
     """
@@ -216,9 +216,9 @@ class DeepestPress(NamedTuple):
     """The depth up to which strokes are reconstructed.
 
     Attributes:
-        depths: depth of the deepest press of each stroke that is reconstructed, as are all between it and the first one found.
+        depths: for each stroke, depth of the last press before the first failure, counted from the first one found.
         forces: forces of those presses.
-        ends: how many strokes end by what: a status, markers lost, the surface off, nothing up to the deepest press tried.
+        ends: number of strokes by the reason of their end: a status, markers lost, the surface off, or the deepest press tried.
     """
 
     depths: Sequence[float]
@@ -227,27 +227,27 @@ class DeepestPress(NamedTuple):
 
 
 class SpecSheet(NamedTuple):
-    """What to expect of a sensor.
+    """The expected accuracy of a sensor.
 
     Attributes:
         name: name of the sensor.
-        length_unit: the sensor's.
+        length_unit: the sensor's length unit.
         force_unit: "N" | "relative".
-        noise: noise of the images, white over its standard deviation, dB.
+        noise: noise of the images, white level over standard deviation, dB.
         seed: seed of presses and noise.
         simulated_on: the simulator's grid.
-        reconstructed_on: the sensor's own.
+        reconstructed_on: the sensor's solver grid.
         spacing: spacing of the markers, length unit.
-        near: distance from where it is within which a contact counts as found, length unit.
-        left_out: for each stroke or direction of pairs that could not be simulated, why.
-        rest: at rest.
+        near: largest position error of a contact that counts as found, length unit.
+        left_out: reason for each stroke or direction of pairs that could not be simulated.
+        rest: figures of frames at rest.
         lightest: figures of light touches.
         bands: errors by force, the lightest first.
-        closest: figures of two touches.
+        closest: figures of pairs of contacts.
         deepest: figures of deep presses.
-        presses: every press of the strokes.
-        pairs: every pair.
-        range: in which presses are right; None where none is.
+        presses: all presses of the strokes.
+        pairs: all pairs.
+        range: the range in which presses are accurate; None if there is none.
     """
 
     name: str

@@ -11,15 +11,15 @@ from ..sensor.working_range import GENERAL, WorkingRange
 from .spec_sheet import Band, ClosestPair, DeepestPress, LightestTouch, PairTrial, PressTrial, RestFloor, RestTrial, Spread
 
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Edges of the bands of force, over the force of the hardest press."""
+"""Edges of the bands of force, over the largest force of all presses."""
 LEAST_DEPTH = 0.05
-"""Over the size: of the presses that a range is judged by."""
+"""Smallest depth of the presses from which a range is derived, over the size."""
 UNBROKEN = "the deepest press tried"
 UNFOUND = "never found"
 
 
 def spread(values: Sequence[float]) -> Spread:
-    """Median and 90 % quantile of those of the values that are finite.
+    """Return the median and the 90 % quantile of the finite values.
 
     Example:
         >>> spread([3.0, 1.0, 2.0, float("inf")])
@@ -34,7 +34,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def rest_floor(trials: Sequence[RestTrial]) -> RestFloor:
-    """The summary of frames at rest."""
+    """Summarise frames at rest."""
     good = [trial for trial in trials if trial.status == Status.OK]
     return RestFloor(
         frames=len(trials),
@@ -47,11 +47,11 @@ def rest_floor(trials: Sequence[RestTrial]) -> RestFloor:
 
 
 def bands(trials: Sequence[PressTrial], near: float) -> list[Band]:
-    """Errors by force, in bands that end at `EDGES` of the hardest press; those without a press are left out.
+    """Summarise errors by force, in bands bounded by `EDGES` times the largest force; bands without a press are left out.
 
     Args:
         trials: the presses.
-        near: distance within which a contact is found, length unit.
+        near: largest position error of a contact that counts as found, length unit.
     """
     hardest = max((trial.force for trial in trials), default=0.0)
     table = []
@@ -77,11 +77,11 @@ def bands(trials: Sequence[PressTrial], near: float) -> list[Band]:
 
 
 def lightest_touch(trials: Sequence[PressTrial], near: float) -> LightestTouch:
-    """The first frame of every stroke in which, and in the next of which, the contact is found: a single find may be chance.
+    """Summarise the first frames in which contacts are found; the next frame must confirm each, as one may be chance.
 
     Args:
-        trials: the presses, those of a stroke as they follow each other.
-        near: distance within which a contact is found, length unit.
+        trials: the presses, in order within each stroke.
+        near: largest position error of a contact that counts as found, length unit.
     """
     each = _strokes(trials)
     first = [stroke[k] for stroke in each if (k := _first_found(stroke, near)) is not None]
@@ -90,11 +90,11 @@ def lightest_touch(trials: Sequence[PressTrial], near: float) -> LightestTouch:
 
 
 def deepest_press(trials: Sequence[PressTrial], near: float) -> DeepestPress:
-    """The depth up to which every stroke is reconstructed without a failure, from the first frame found on; 0 if none is.
+    """Summarise the depths up to which strokes are reconstructed without failure from the first frame found; 0 if none is.
 
     Args:
-        trials: the presses, those of a stroke as they follow each other.
-        near: distance within which a contact is found, length unit.
+        trials: the presses, in order within each stroke.
+        near: largest position error of a contact that counts as found, length unit.
     """
     depths, forces, ends = [], [], []
     for stroke in _strokes(trials):
@@ -108,7 +108,7 @@ def deepest_press(trials: Sequence[PressTrial], near: float) -> DeepestPress:
 
 
 def closest_pair(trials: Sequence[PairTrial]) -> ClosestPair:
-    """For every direction, the smallest distance at which a pair and all wider pairs are resolved."""
+    """Summarise, over all directions, the smallest distance at which a pair and all wider pairs are resolved."""
     smallest = []
     directions = sorted({trial.direction for trial in trials})
     for direction in directions:
@@ -120,14 +120,13 @@ def closest_pair(trials: Sequence[PairTrial]) -> ClosestPair:
 
 
 def working_range(trials: Sequence[PressTrial], size: float, fingerprint: str) -> WorkingRange | None:
-    """The range in which presses were shown right: up to the deepest that is shallower than every wrong one, and the hardest of
-    these. None where there is none.
+    """Derive the validated working range: limits from the presses that are shallower than every wrong one; None if none is.
 
-    Wrong is a press with status ok whose surface is off by more than `CLOSE` of its displacement, or whose force is, unless it
-    is said to be a lower bound. Presses shallower than `LEAST_DEPTH` are left out: there it is noise that decides.
+    A press is wrong if its status is ok and `PressTrial.is_wrong`. Presses shallower than `LEAST_DEPTH` are ignored, because
+    noise dominates their errors.
 
     Args:
-        trials: the presses, without limits.
+        trials: the presses, reconstructed without range limits.
         size: size of the surface, length unit.
         fingerprint: fingerprint of the sensor.
     """

@@ -1,7 +1,7 @@
-"""Calibration (section 5.2): lens, ports, rest surface, dots and material from images, and the way back, to a layout of dots.
+"""Calibration (section 5.2): lens, ports, rest surface, dots and material from images, and the inverse, a layout of dots.
 
-Each step takes the sensor, or the camera, of the step before and gives it with what was found and how surely. The names are
-loaded when they are first used.
+Each step takes the sensor or camera from the step before, and returns it with the values found and their uncertainty. Modules
+are imported when their names are first used.
 
 Example:
     >>> from torchmembrane import calibrate

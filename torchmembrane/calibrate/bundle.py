@@ -1,4 +1,4 @@
-"""Bundle adjustment: dots and camera poses from dots measured in several views, the scale from one length of travel."""
+"""Bundle adjustment: positions of dots and camera poses from several views; a known camera travel sets the scale."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -10,18 +10,18 @@ from torch.func import jacfwd, vmap
 
 from .fit import Fit, fit, outliers, outline_centres, rotations
 
-LOCATION_NOISE = 0.05  # px, of a located dot, before it is known
+LOCATION_NOISE = 0.05  # px, initial guess of the noise of located dots
 
 
 class Bundle(NamedTuple):
-    """D dots in P views.
+    """Observations of D dots in P views, and a first guess of dots and poses.
 
     Attributes:
-        projections: of each view, from points `[..., 3]` in the frame of its pose to pixels `[..., 2]`.
-        motions: `[P - 1, 6]` first guess of all poses but the first: rotation vectors (rad) and positions in its frame.
-        dots: `[D, 3]` first guess of the dots' centres, first camera's frame.
-        around: `[D, K, 3]` points of each dot's outline, from its centre.
-        pixels: `[P, D, 2]` measured centres of the outlines, px, NaN where not visible.
+        projections: for each view, the function from points `[..., 3]` in the frame of its pose to pixels `[..., 2]`.
+        motions: first guess of all poses but the first, `[P - 1, 6]`: rotation vectors (rad) and positions in the first frame.
+        dots: first guess of the dots' centres, `[D, 3]`, first camera's frame.
+        around: points on each dot's outline relative to its centre, `[D, K, 3]`.
+        pixels: measured centres of the outlines, `[P, D, 2]`, px; NaN where a dot is not visible.
     """
 
     projections: Sequence[Callable[[Tensor], Tensor]]
@@ -31,21 +31,22 @@ class Bundle(NamedTuple):
     pixels: np.ndarray
 
     def in_two_views(self) -> tuple["Bundle", np.ndarray]:
-        """The dots that are visible in two views or more, and which they are, `[D]` bool."""
+        """Return the bundle of the dots that are visible in at least two views, and the mask of these dots, `[D]` bool."""
         visible = np.isfinite(self.pixels).all(-1)
         kept = visible.sum(0) >= 2
         return self._replace(dots=self.dots[kept], around=self.around[kept], pixels=self.pixels[:, kept]), kept
 
 
 def bundle_adjusted(bundle: Bundle, travel_error: float) -> tuple["BundleProblem", Fit]:
-    """Poses and dots that explain the pixels, mistaken ones left out.
+    """Fit poses and dots to the measured pixels, without outliers.
 
     Args:
-        bundle: what was measured, each dot in two views or more.
-        travel_error: standard deviation of the second view's travel, whose first guess is the scale.
+        bundle: the observations; each dot is visible in at least two views.
+        travel_error: standard deviation of the distance from the first to the second view, length unit; the first guess of this
+            distance sets the scale.
 
     Returns:
-        The problem, which says what was used, and the fit of `theta = (motions [P - 1, 6], dots [D, 3])`.
+        The problem, with the mask of the pixels used, and the fit of `theta = (motions [P - 1, 6], dots [D, 3])`.
     """
     problem = BundleProblem(bundle, LOCATION_NOISE / travel_error)
     theta = np.concatenate([bundle.motions.ravel(), bundle.dots.ravel()])
@@ -57,15 +58,17 @@ def bundle_adjusted(bundle: Bundle, travel_error: float) -> tuple["BundleProblem
 
 
 class BundleProblem:
-    """Least squares for `theta = (motions [P - 1, 6], dots [D, 3])`: pixels used, modelled less measured, then the travel.
+    """Least-squares problem for `theta = (motions [P - 1, 6], dots [D, 3])`.
+
+    Its residuals are the modelled minus the measured pixels, for the pixels used, and then the weighted error of the travel.
 
     Args:
-        bundle: what was measured, and the first guess.
-        travel_weight: what an error of the travel counts, px per length unit.
+        bundle: the observations and the first guess.
+        travel_weight: weight of an error of the travel, px per length unit.
 
     Attributes:
-        used: `[P, D]` bool, the pixels that count.
-        own: how many numbers the motions have.
+        used: mask of the pixels used, `[P, D]` bool.
+        own: number of unknowns of the motions.
     """
 
     def __init__(self, bundle: Bundle, travel_weight: float):
@@ -78,7 +81,7 @@ class BundleProblem:
         self._derivatives = [vmap(jacfwd(of_view, (0, 1)), (None, 0, 0)) for of_view in modelled]
 
     def pixel_residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Measured less modelled, `[P, D, 2]`, NaN where not used."""
+        """Return measured minus modelled pixels, `[P, D, 2]`; NaN where not used."""
         return np.where(self.used[..., None], self.pixels - self._all_views(theta), np.nan)
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
@@ -100,18 +103,18 @@ class BundleProblem:
         return np.concatenate([J[self.used].reshape(-1, own + 3 * D), row])
 
     def _all_views(self, theta: np.ndarray) -> np.ndarray:
-        """Where each view has the dots' outlines, `[P, D, 2]`."""
+        """Return the modelled centres of the dots' outlines in each view, `[P, D, 2]`, px."""
         motions, dots, around = self._parts(theta)
         return np.stack([of_view(motion, dots, around) for of_view, motion in zip(self._views, motions, strict=True)])
 
     def _parts(self, theta: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        """All motions `[P, 6]`, the first zero, dots `[D, 3]`, and the points around them."""
+        """Return all motions in `theta` `[P, 6]`, the first one zero, its dots `[D, 3]`, and the outline points."""
         moved = torch.from_numpy(theta[: self.own]).view(-1, 6)
         return torch.cat([moved.new_zeros(1, 6), moved]), torch.from_numpy(theta[self.own :]).view(-1, 3), self.around
 
 
 def _modelled(project: Callable[[Tensor], Tensor]) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """Where a view has the centre of a dot's outline, `[2]`, from its motion `[6]`, the dot `[3]` and points around it."""
+    """Return the function from motion `[6]`, dot `[3]` and outline points to the centre of the dot's outline, `[2]` px."""
 
     def centre(motion: Tensor, dot: Tensor, around: Tensor) -> Tensor:
         return outline_centres(project((dot + around - motion[3:]) @ rotations(motion[:3])))

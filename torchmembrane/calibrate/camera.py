@@ -18,17 +18,17 @@ LENS = ("focal", "centre", "distortion")
 PORTS = ("port_distance", "port_thickness", "port_index", "medium_index")
 
 DESIGN = {"port_distance": 0.2, "port_thickness": 0.2, "port_index": 0.1, "medium_index": 0.1}
-"""Relative standard deviation of the sensor file's values: what views leave open stays near them, with this uncertainty."""
-LOCATION_NOISE = 0.05  # px, of a point found in an image, before it is known
-ROUNDS = 2  # of leaving out mistakes
+"""Relative standard deviation of the sensor file's values: values that views do not determine stay near these."""
+LOCATION_NOISE = 0.05  # px, initial guess of the noise of a point found in an image
+ROUNDS = 2  # of outlier rejection
 
 
 class Views(NamedTuple):
-    """A board in P poses before the camera.
+    """Images of a board in P poses.
 
     Attributes:
-        pixels: `[P, D, 2]` where its points are in the images, px, NaN where not visible.
-        filled: `[P]` bool: with the medium behind the last port; else with air.
+        pixels: positions of the board's D points in the images, `[P, D, 2]`, px; NaN where a point is not visible.
+        filled: whether the medium, rather than air, is behind the last port, `[P]` bool.
     """
 
     pixels: np.ndarray
@@ -40,10 +40,10 @@ class CameraFit(NamedTuple):
 
     Attributes:
         camera: the camera.
-        names: names of the n numbers that were fitted.
-        fit: fit of these numbers, which come first, and then of 6 of each pose.
-        poses: `[P, 6]` rotation vectors (rad) and translations (length unit) of the board.
-        residuals: `[P, D, 2]` px, measured less modelled, NaN where not used.
+        names: names of the n camera parameters that were fitted.
+        fit: fit of these parameters, followed by the 6 numbers of each pose.
+        poses: rotation vectors (rad) and translations (length unit) of the board, `[P, 6]`.
+        residuals: measured minus modelled pixels, `[P, D, 2]`; NaN where not used.
     """
 
     camera: Camera
@@ -55,23 +55,23 @@ class CameraFit(NamedTuple):
 
 @check_arguments
 def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> CameraFit:
-    """Focal lengths, centre and distortion, all coefficients of the camera's model, from views of a board in air.
+    """Fit focal lengths, centre and all distortion coefficients of the camera's model to views of a board in air.
 
-    Of a pinhole these are five, or eight where the first guess has eight, zeros for example.
+    A pinhole camera has five distortion coefficients, or eight if the first guess has eight (they may be zeros).
 
-    OpenCV gives the start, Gauss-Newton on this package's own camera the answer and its uncertainty. Ports of `camera` are
-    taken as not yet mounted; they are in the camera that is returned.
+    OpenCV gives the start; least squares with this package's camera model gives the result and its uncertainty. The fit assumes
+    that the ports of `camera` are not mounted yet; the returned camera has them.
 
     Args:
         camera: a first guess: model, image size, focal lengths, centre.
         board: the board.
-        views: at least three, better ten, in different poses.
+        views: at least three views, better ten, in different poses.
 
     Returns:
         The camera with its lens, and the fit.
 
     Raises:
-        MembraneError: too few views, or no lens fits them; OpenCV is not installed.
+        MembraneError: there are too few views, no lens fits them, or OpenCV is not installed.
 
     Example:
         >>> board, true = Checkerboard(6, 5, 3.0), Camera("pinhole", (320, 240), (150.0, 151.0), (161.0, 119.0))
@@ -94,23 +94,23 @@ def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> Camera
 
 @check_arguments
 def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequence[str] = ()) -> CameraFit:
-    """Distance, thickness and index of every port, and the medium's index, from views of a dot board through them.
+    """Fit distance, thickness and refractive index of every port, and the medium's index, to views of a dot board.
 
     Args:
-        camera: a first guess of ports and medium, with a lens that is taken as known.
+        camera: a first guess of ports and medium, with a calibrated lens.
         board: the board.
-        views: in air, in the medium, best both.
-        held: those of `PORTS` that stay as they are in `camera`.
+        views: views in air, in the medium, or best in both.
+        held: names from `PORTS` whose values stay as in `camera`.
 
     Returns:
         The camera with its ports, and the fit.
 
     Raises:
-        MembraneError: the camera has no ports, `held` names something else, or a view shows too few dots.
+        MembraneError: the camera has no ports, `held` has an unknown name, or a view shows too few dots.
 
     Limitations:
-        In air a plate shifts every ray by a length that depends neither on its distance nor on the medium; in a medium its
-        thickness and index are not identifiable one by one (docs/calibration.md). Give views of both.
+        In air, the shift of a ray by a plate depends neither on the plate's distance nor on the medium; in a medium, thickness
+        and index of a plate cannot be identified separately (docs/calibration.md). Use views of both.
 
     Example:
         >>> lens = "pinhole", (320, 240), (150.0, 150.0), (160.0, 120.0)
@@ -134,7 +134,7 @@ def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequen
 
 
 def _fit_camera(problem: "_BoardProblem", poses: np.ndarray, what: str) -> CameraFit:
-    """The problem's least squares from its own camera and `poses [P, 6]`, mistaken points left out."""
+    """Solve the least-squares problem from its camera and `poses [P, 6]`, without outliers."""
     theta = np.concatenate([problem.start, poses.ravel()])
     problem.leave_out_unseen(theta)
     for _ in range(ROUNDS):
@@ -148,17 +148,17 @@ def _fit_camera(problem: "_BoardProblem", poses: np.ndarray, what: str) -> Camer
 
 
 class _BoardProblem:
-    """Least squares for numbers of a camera and the poses of a board, `theta = (numbers [n], poses [P, 6])`.
+    """Least-squares problem for parameters of a camera and the poses of a board, `theta = (parameters [n], poses [P, 6])`.
 
-    Residuals: pixels of all points used, modelled less measured, and before them the numbers' distance from the first guess,
-    weighted as pixels, for those whose standard deviation is given.
+    Its residuals are the deviations of the parameters from the first guess, weighted as pixels (zero for those without a
+    standard deviation), and then the modelled minus the measured pixels of all points used.
 
     Args:
         camera: the first guess.
         board: the board.
-        views: what was measured.
-        free: names of the camera's buffers that are unknown.
-        spread: relative standard deviation of the first guess of some of them, one more datum each.
+        views: the measured points.
+        free: names of the camera's buffers that are fitted.
+        spread: relative standard deviation of the first guess of some of these buffers.
     """
 
     def __init__(
@@ -181,23 +181,23 @@ class _BoardProblem:
 
     @property
     def names(self) -> list[str]:
-        """Names of the camera's numbers, `[n]`."""
+        """Names of the camera's n parameters."""
         return [
             name if shape.numel() == 1 else f"{name}[{i}]" for name, shape in self.shapes.items() for i in range(shape.numel())
         ]
 
     def camera_of(self, theta: np.ndarray) -> Camera:
-        """The camera with these numbers."""
+        """Return the camera with the parameters in `theta`."""
         shared, _, _ = self.parts(theta)
         return _with(self.camera, dict(zip(self.shapes, shared.split(self.lengths), strict=True)))
 
     def parts(self, theta: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        """Numbers of the camera `[n]`, poses `[P, 6]`, and which views are filled `[P]`."""
+        """Return the camera's parameters `[n]` and the poses `[P, 6]` in `theta`, and the mask of filled views `[P]`."""
         values = torch.from_numpy(theta)
         return values[: self.count], values[self.count :].view(-1, 6), self.filled
 
     def pixel_residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Measured less modelled, `[P, D, 2]`, NaN where not used."""
+        """Return measured minus modelled pixels, `[P, D, 2]`; NaN where not used."""
         left = self.pixels - self._all_views(*self.parts(theta))
         return torch.where(self.used[..., None], left, torch.nan).numpy()
 
@@ -217,18 +217,18 @@ class _BoardProblem:
         return np.concatenate([rows, J[self.used].flatten(0, 1).numpy()])
 
     def leave_out_unseen(self, theta: np.ndarray) -> None:
-        """Leave out points that the camera of the first guess cannot image."""
+        """Exclude points that the camera of the first guess cannot image."""
         self.used &= self._all_views(*self.parts(theta)).isfinite().all(-1)
 
     def leave_out_outliers(self, theta: np.ndarray) -> None:
-        """Leave out points that are mistakes, take in those that are none, and weight the first guess by the noise found."""
+        """Exclude outliers, include all other visible points, and weight the first guess by the estimated noise."""
         left = (self._all_views(*self.parts(theta)) - self.pixels)[self.visible].numpy()
         mistaken = outliers(left)
         self.design_weight = self.design_precision * np.median(np.abs(left[~mistaken])) / 0.6745
         self.used[self.visible] = torch.from_numpy(~mistaken)
 
     def _modelled(self, shared: Tensor, pose: Tensor, filled: Tensor) -> Tensor:
-        """Where one view has the board's points, `[D, 2]`."""
+        """Return the modelled pixels of the board's points in one view, `[D, 2]`."""
         parts = zip(self.shapes.items(), shared.split(self.lengths), strict=True)
         buffers = {name: part.view(shape) for (name, shape), part in parts}
         n = buffers.get("medium_index", self.camera.medium_index)
@@ -238,7 +238,7 @@ class _BoardProblem:
 
 
 def _with(camera: Camera, values: Mapping[str, Tensor]) -> Camera:
-    """The camera with other values of some buffers; raises `MembraneError` where they make none."""
+    """Return the camera with other values of some buffers; raise `MembraneError` if they are not a valid camera."""
 
     def get(name: str) -> list[float]:
         return values.get(name, getattr(camera, name)).reshape(-1).tolist()

@@ -1,4 +1,4 @@
-"""The rest surface from a depth image that is registered to the sensor's camera, or to that of a view; dots placed on it."""
+"""Rest surface and dots from a depth image that is registered to the sensor's camera, or to the camera of one view."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,22 +17,22 @@ from .surface import Correction, SurfaceProjection, correction, fine_surface, re
 from .view_poses import placed_view, rest_from_view_images
 from .views import placed_dots, with_dots_of_each_view
 
-CELL = 24  # px: over such squares depths are averaged
+CELL = 24  # px, side of the squares over which depths are averaged
 FEWEST = 8  # depths in a square
-NEAR = 0.1  # of the surface's size: depths farther from the design are of something else
+NEAR = 0.1  # over the surface's size: depths farther from the design belong to something else
 FEWEST_SQUARES = 12
 UNITS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
-"""By how much depths in another unit are off."""
+"""Possible scale errors of depths in a wrong unit."""
 
 
 class DepthFit(NamedTuple):
-    """The sensor with the surface of a depth image.
+    """The sensor with the rest surface found in a depth image.
 
     Attributes:
         sensor: the sensor with the surface and the dots found.
-        surface: `Correction` of the designed surface.
-        projection: `[N]` squares of averaged depths, projected onto the designed surface.
-        deviations: `[N]` standard deviations of their signed distances, length unit.
+        surface: the `Correction` of the designed surface.
+        projection: the averaged depths of N squares, projected onto the designed surface.
+        deviations: standard deviations of their signed distances, `[N]`, length unit.
     """
 
     sensor: Sensor
@@ -43,25 +43,25 @@ class DepthFit(NamedTuple):
 
 @check_arguments
 def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, progress: Progress = silent) -> DepthFit:
-    """Rest surface from a depth image, and the dots on it from the rest image.
+    """Find the rest surface in a depth image, and the dots on it in the rest image.
 
-    The depths within the rim's outline are averaged over squares of 24 px; the designed surface is moved along its normals onto
+    Depths within the rim's outline are averaged over squares of 24 px; the designed surface is moved along its normals onto
     these averages.
 
     Args:
         sensor: the design.
-        depth: `[H, W]` z along the camera's axis, length unit; NaN, infinity or 0 where there is none.
-        image: `[H, W]` the membrane at rest, grey in 0..1.
-        progress: is told how far it is.
+        depth: z along the camera's axis, `[H, W]`, length unit; NaN, infinity or 0 where it is unknown.
+        image: grey image of the membrane at rest, `[H, W]`, in 0..1.
+        progress: called with the completed share.
 
     Returns:
-        The sensor with the surface and dots found, and what they rest on.
+        The `DepthFit`.
 
     Raises:
-        MembraneError: the depth image has another size than the camera's, or too few depths or dots are found.
+        MembraneError: the depth image does not have the camera's size, or too few depths or dots are found.
 
     Limitations:
-        Depths farther from the design than a tenth of the surface's size are taken for something else and left out.
+        Depths farther from the design than a tenth of the surface's size are ignored.
 
     Example:
         >>> from dataclasses import replace
@@ -112,25 +112,26 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
 def rest_from_depth_of_view(
     sensor: Sensor, number: int, depth: np.ndarray, images: Sequence[np.ndarray], *, progress: Progress = silent
 ) -> DepthFit:
-    """Rest surface of a sensor with several views from a depth image of one of them, the dots that any of them sees, and poses.
+    """Find rest surface, dots and poses of a sensor with several views, from a depth image of one view.
 
-    Surface and dots as of `rest_from_depth` in that view; each other camera then stands where its image shows these dots.
+    `rest_from_depth` finds surface and dots in that view; the poses of the other cameras are then fitted to these dots in their
+    images, and dots that any view sees are added.
 
     Args:
-        sensor: the design, with several views, their poses roughly.
+        sensor: the design with several views and approximate poses.
         number: number of the view to whose camera the depth image is registered, from 0.
-        depth: `[H, W]` z along that camera's axis, length unit; NaN, infinity or 0 where there is none.
-        images: of each view, `[H, W]` the membrane at rest, grey in 0..1.
-        progress: is told how far it is.
+        depth: z along that camera's axis, `[H, W]`, length unit; NaN, infinity or 0 where it is unknown.
+        images: grey image of the membrane at rest for each view, `[H, W]`, in 0..1.
+        progress: called with the completed share.
 
     Returns:
-        As of `rest_from_depth`, the sensor with all views; what it rests on in the frame of the view.
+        The `DepthFit`: the sensor with all views; surface, projection and deviations are in the frame of the given view.
 
     Raises:
-        MembraneError: as of `rest_from_depth` and `rest_from_view_images`.
+        MembraneError: as for `rest_from_depth` and `rest_from_view_images`.
 
     Limitations:
-        Where the view is not the first one, its pose in the file must be right to half the dots' pitch in the first image.
+        If the view is not the first one, its pose in the file must be accurate to half the dots' pitch in the first image.
 
     Example:
         >>> from scipy.interpolate import griddata
@@ -162,14 +163,14 @@ def rest_from_depth_of_view(
     progress(0.6, "where each view stands")
     if number:
         whole = rest_from_view_images(whole, images, progress=within(progress, 0.6, 0.9)).sensor
-    else:  # where the first view sees the surface is what the depths say
+    else:  # the depths determine the surface in the first view
         for further in range(1, len(views)):
             whole, _ = placed_view(whole, further, images[further])
     return found._replace(sensor=with_dots_of_each_view(whole, images))
 
 
 def _too_few(sensor: Sensor, depth: np.ndarray, squares: int) -> str:
-    """What is wrong where so few squares of depths are near the designed surface."""
+    """Return the error message if too few squares of depths are near the designed surface."""
     within, designed = depth[_measured(sensor, depth)], float(sensor.membrane.rest[:, 2].median())
     said = (
         f"calibrate depth: {squares} squares of {CELL} px have depths near the designed surface; expected {FEWEST_SQUARES} or "
@@ -184,13 +185,13 @@ def _too_few(sensor: Sensor, depth: np.ndarray, squares: int) -> str:
 
 
 def _measured(sensor: Sensor, depth: np.ndarray) -> np.ndarray:
-    """Pixels `[H, W]` within the rim's outline that have a depth."""
+    """Return the mask `[H, W]` of pixels within the rim's outline that have a depth."""
     mask: np.ndarray = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest)) & np.isfinite(depth) & (depth > 0)
     return mask
 
 
 def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points `[N, 3]` of every other pixel within the rim's outline, and the square that each is in `[N]`."""
+    """Return the points `[N, 3]` of every other row and column of pixels within the rim's outline, and their squares `[N]`."""
     mask = _measured(sensor, depth)
     mask[1::2] = mask[:, 1::2] = False
     v, u = np.nonzero(mask)

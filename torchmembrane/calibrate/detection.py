@@ -1,4 +1,4 @@
-"""Targets found in images: corners of a checkerboard by OpenCV, dots by this package's own detector."""
+"""Detection of calibration targets: corners of a checkerboard by OpenCV, dots of a board by this package's detector."""
 
 import heapq
 from typing import Any
@@ -12,25 +12,26 @@ from ..files.levels import too_few_bits
 from ..files.optional import load_opencv
 from ..markers.dots.pattern import find_dots
 
-WINDOW = 0.35  # of the shortest side of a square, in which a corner is fitted
+WINDOW = 0.35  # half width of the window in which a corner is refined, over the shortest side of a square
 FAR_OFF = 10**6
 FEWEST_CORNERS = 3  # in a row and in a column
-STEP_ERROR = 0.35  # of a lattice step, by which a neighbour may be off its prediction
+STEP_ERROR = 0.35  # largest distance of a neighbour from its prediction, over the lattice step
 
 
 @check_arguments
 def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray:
-    """The board's points in an image.
+    """Find the board's points in an image.
 
     Args:
-        image: `[H, W]` grey in 0..1.
+        image: the grey image, `[H, W]`, in 0..1.
         board: the board that the image shows.
 
     Returns:
-        `[D, 2]` px, in the order of `board.points`; NaN where a dot is not visible. Of a checkerboard all corners are found.
+        Pixels `[D, 2]` in the order of `board.points`; NaN for dots that are not visible. A checkerboard must be visible
+        completely.
 
     Raises:
-        MembraneError: the image does not show the board; OpenCV is not installed (checkerboards).
+        MembraneError: the image does not show the board, or OpenCV is not installed (needed for checkerboards).
 
     Example:
         >>> from torchmembrane.camera.model import Camera
@@ -64,7 +65,7 @@ def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
 
 
 def _other_board(grey: np.ndarray, board: Checkerboard) -> str:
-    """What to add where another board is in the image: it may have as many squares as corners were asked for."""
+    """Return a hint for the message if the image shows a smaller board: the user may have counted squares, not corners."""
     cv2, columns, rows = load_opencv(), board.columns - 1, board.rows - 1
     if min(columns, rows) < FEWEST_CORNERS:
         return ""
@@ -95,12 +96,12 @@ def _find_board_dots(image: np.ndarray, board: DotBoard) -> np.ndarray:
 
 
 def _lattice_steps(pixels: np.ndarray) -> np.ndarray:
-    """Lattice steps `[N, 2]` of dots `[N, 2]`, from the middle one, surest first; `FAR_OFF`: not reached."""
+    """Return the lattice steps `[N, 2]` of dots `[N, 2]` from the central one, best matches first; `FAR_OFF`: not reached."""
     start = int(np.linalg.norm(pixels - np.median(pixels, 0), axis=1).argmin())
     steps = np.full(pixels.shape, FAR_OFF)
     placed: set[int] = set()
     taken: set[tuple[int, int]] = set()
-    front: list[tuple[Any, ...]] = [(0.0, start, (0, 0), _first_basis(pixels, start))]  # gap, dot, its steps, basis
+    front: list[tuple[Any, ...]] = [(0.0, start, (0, 0), _first_basis(pixels, start))]  # gap, dot, its steps, local basis
     while front:
         _, here, step, basis = heapq.heappop(front)
         if here in placed or step in taken:
@@ -120,7 +121,7 @@ def _lattice_steps(pixels: np.ndarray) -> np.ndarray:
 
 
 def _first_basis(pixels: np.ndarray, start: int) -> tuple[tuple[float, float], ...]:
-    """Steps to two neighbours, the second one a quarter turn clockwise (in the image) from the first."""
+    """Return the steps to two neighbours; in the image, the second is a clockwise quarter turn from the first."""
     offset = np.delete(pixels - pixels[start], start, 0)
     near = offset[np.linalg.norm(offset, axis=1).argsort()[:4]]
     first = near[0]
@@ -129,14 +130,14 @@ def _first_basis(pixels: np.ndarray, start: int) -> tuple[tuple[float, float], .
 
 
 def _larger_than_neighbours(steps: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """`[N]` bool: dots about as much larger than the dots within two steps as large ones are."""
+    """Return which dots are larger than those within two lattice steps by about the ratio of large dots, `[N]` bool."""
     near = np.abs(steps[:, None] - steps).max(-1) <= 2
     usual = np.array([np.median(radius[row]) for row in near])
     return (radius > LARGE**0.5 * usual) & (near.sum(1) > 3)
 
 
 def _turned_to_marks(steps: np.ndarray, large: np.ndarray) -> np.ndarray:
-    """The steps, turned and shifted so that the large dots are the board's marks."""
+    """Return the steps rotated and shifted such that the large dots are the board's marks."""
     quarter = np.array([[0, 1], [-1, 0]])
     for turn in range(4):
         turned = steps @ np.linalg.matrix_power(quarter, turn)

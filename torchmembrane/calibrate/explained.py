@@ -1,8 +1,8 @@
-"""Presses explained: what their shapes say of the prestretch, at the height of the rest surface that they tell.
+"""Inference of the prestretch, and of the rest surface's height, from the shapes of presses.
 
-The loss of the presses changes with the prestretch and with the rest surface's height. Of an inflated surface, whose height
-is one number, the height of the least loss is looked for in rounds; any other surface keeps its own, and only the effect of
-another height is found.
+The loss of the presses depends on the prestretch and on the rest surface's height. For an inflated surface, whose height is one
+number, the height of least loss is found iteratively. Any other surface keeps its height, and only the effect of another height
+is computed.
 """
 
 from dataclasses import replace
@@ -23,19 +23,19 @@ from .presses import STRETCHES, LossProfile, Presses
 from .rest_error import HeightEffect, PressesTold, StatedHeight, changed_height, height_effect, height_told
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
-PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
-PRESTRETCH_ERROR_INFLATED = 0.02  # the same where the rest surface's height is found with it
-UNKNOWN = float(np.log(STRETCHES[-1] / STRETCHES[0])) / 12**0.5  # of the logarithm of a prestretch that may be any of those
-WRONG = 0.02  # probability that an image is explained wrongly altogether and carries no information
+PRESTRETCH_ERROR = 0.03  # relative standard deviation due to the grid and the loss, common to all images
+PRESTRETCH_ERROR_INFLATED = 0.02  # the same if the rest surface's height is estimated as well
+UNKNOWN = float(np.log(STRETCHES[-1] / STRETCHES[0])) / 12**0.5  # standard deviation of a uniform log prestretch
+WRONG = 0.02  # probability that an image is explained wrongly and carries no information
 HEIGHT_ROUNDS = 4
-RANGE, NEAR = 3.0, 7  # standard deviations to either side in which the prestretch is looked for again; how many are tried
-FINE = 4001  # prestretches over which the probability is summed
-HEIGHT_SHARE = 0.15  # of the time, measured: the losses on a rest surface of another height
+RANGE, NEAR = 3.0, 7  # half width of the refined search, standard deviations, and its number of prestretches
+FINE = 4001  # number of prestretches over which probabilities are summed
+HEIGHT_SHARE = 0.15  # share of the time that losses at another height of the rest surface take, measured
 
 
 class MeasuredPresses(NamedTuple):
-    """What is known of presses: the markers' displacement `[B, D, 2]` px and confidence `[B, D]`, forces or pressures as of
-    `material_from_pixels`, the rest surface's height, the displacements' covariance (default: the rest image's)."""
+    """Measurements of presses: the markers' displacement `[B, D, 2]` px and confidence `[B, D]`; forces and pressures as for
+    `material_from_pixels`; the rest surface's height; the displacements' covariance (default: the rest image's)."""
 
     displacement: Tensor
     confidence: Tensor
@@ -47,13 +47,13 @@ class MeasuredPresses(NamedTuple):
 
     @property
     def tells_modulus(self) -> bool:
-        """Whether anything but the shapes is known."""
+        """Whether forces or pressures are known, so that the modulus can be inferred."""
         return any(given is not None for given in (self.forces, self.pressures, self.overpressure))
 
 
 class ByShapes(NamedTuple):
-    """What the presses' shapes say of the logarithm of the prestretch: its mean and standard deviation, that of the losses
-    alone, and mean and variance by each image `[B]`."""
+    """The logarithm of the prestretch inferred from the shapes of presses: its mean and standard deviation, the standard
+    deviation due to the losses alone, and mean and variance from each image alone, `[B]`."""
 
     mean: float
     deviation: float
@@ -63,23 +63,23 @@ class ByShapes(NamedTuple):
 
     @property
     def around(self) -> np.ndarray:
-        """One deviation below, the mean, and one above, `[3]`."""
+        """The mean log prestretch minus one standard deviation, the mean, and plus one, `[3]`."""
         found: np.ndarray = self.mean + self.deviation * np.array([-1.0, 0.0, 1.0])
         return found
 
     @property
     def near(self) -> np.ndarray:
-        """Prestretches close together about the mean, `[S]`."""
+        """Closely spaced prestretches around the mean, `[S]`."""
         found: np.ndarray = np.exp(self.mean + RANGE * self.deviation * np.linspace(-1, 1, NEAR)).clip(*STRETCHES[[0, -1]])
         return np.unique(found)
 
 
 def by_shapes(profile: LossProfile, shared_error: float = PRESTRETCH_ERROR) -> ByShapes:
-    """The presses' losses as probabilities: of all, and of each image.
+    """Infer the prestretch from the losses of all images, and of each image alone.
 
     Args:
         profile: the losses.
-        shared_error: relative standard deviation of the prestretch that all images have in common.
+        shared_error: relative standard deviation of the error of the prestretch that is common to all images.
     """
     each, own = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T]).T
     mean, by_losses = _log_stretch(profile.stretches, profile.losses)
@@ -90,16 +90,16 @@ def by_shapes(profile: LossProfile, shared_error: float = PRESTRETCH_ERROR) -> B
 
 
 class ExplainedPresses(NamedTuple):
-    """Presses as explained at one height of the rest surface.
+    """The solutions of the presses at one height of the rest surface.
 
     Attributes:
-        sensor: with this surface and the presses' markers.
-        presses: on it.
-        other: on a surface of another height, one `height.reach`.
-        profile: their losses.
-        shapes: what these tell of the prestretch.
-        by: what they tell with the height, and of it.
-        height: what was stated of it.
+        sensor: the sensor with this surface and the presses' markers.
+        presses: the presses on this surface.
+        other: the presses on a surface of another height.
+        profile: losses of the presses by prestretch.
+        shapes: the prestretch inferred from these losses.
+        by: the inferred height, and the effect of the height on prestretch and forces.
+        height: the height as stated beforehand.
     """
 
     sensor: Sensor
@@ -111,20 +111,27 @@ class ExplainedPresses(NamedTuple):
     height: StatedHeight
 
     def raised(self, sensor: Sensor, height: float) -> tuple[Sensor, np.ndarray]:
-        """A sensor of this height with its rest surface higher, in stated standard deviations, and which of the markers it
-        has."""
+        """Raise the rest surface of a sensor.
+
+        Args:
+            sensor: a sensor whose rest surface has the current height.
+            height: increase of the height, in stated standard deviations.
+
+        Returns:
+            The sensor, and the mask of the markers that it still has, `[D]` bool.
+        """
         share = self.height.error / self.height.after(height, 1.0).error - 1
         return changed_height(sensor, self.presses.rest_markers, share)
 
 
 def explained(sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPresses, progress: Progress) -> ExplainedPresses:
-    """The presses at the rest surface of the sensor, or, where it is inflated, at the height that they tell.
+    """Solve the presses on the sensor's rest surface; for an inflated surface, at the height inferred from the presses.
 
     Args:
-        sensor: as it is known.
-        reconstructor: reconstructor of the sensor, on the grid for calibration.
-        known: what is known of the presses.
-        progress: is told how far it is.
+        sensor: the sensor before this calibration.
+        reconstructor: the sensor's reconstructor on the grid for calibration.
+        known: the measurements of the presses.
+        progress: called with the completed share.
     """
     presses = Presses(reconstructor, known.displacement, known.confidence, known.covariance)
     if isinstance(sensor.surface, InflatedSurface):
@@ -137,7 +144,7 @@ def explained(sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPress
 
 
 def _at_told_height(sensor: Sensor, presses: Presses, known: MeasuredPresses, progress: Progress) -> ExplainedPresses:
-    """In rounds, each at the height and with the prestretch that the one before told."""
+    """Iterate over the height: each round uses the height and the prestretch inferred in the round before."""
     stretches, height, is_close = STRETCHES, known.height, False
     for k in range(HEIGHT_ROUNDS):
         of_round = within(progress, k / HEIGHT_ROUNDS, (k + 1) / HEIGHT_ROUNDS)
@@ -159,7 +166,7 @@ def _at_told_height(sensor: Sensor, presses: Presses, known: MeasuredPresses, pr
 
 
 def _modulus(found: ExplainedPresses, own: PressesTold, known: MeasuredPresses) -> list[float]:
-    """The modulus, roughly, if forces or the gauge at rest tell it: of a gas, whose law is in newtons, it enters the shapes."""
+    """Return a rough modulus if forces or the gauge at rest determine it; with a gas in the cavity, the shapes depend on it."""
     sensor, shapes = found.sensor, found.shapes
     if known.overpressure is not None:
         return [modulus_at_rest(sensor, shapes.mean, shapes.deviation, known.overpressure).modulus]
@@ -170,7 +177,7 @@ def _modulus(found: ExplainedPresses, own: PressesTold, known: MeasuredPresses) 
 
 
 def with_material(sensor: Sensor, values: np.ndarray) -> Sensor:
-    """The sensor with this prestretch and, if it is among the values, modulus."""
+    """Return the sensor with the prestretch `values[0]` and, if there is a second value, the modulus `values[1]`."""
     material = replace(sensor.material, prestretch=max(1.0, float(values[0])))
     if len(values) > 1:
         thickness = material.thickness or 1.0
@@ -179,7 +186,7 @@ def with_material(sensor: Sensor, values: np.ndarray) -> Sensor:
 
 
 def coarse_reconstructor(sensor: Sensor) -> Reconstructor:
-    """The sensor's, on `GRID`; refused where its presses tell no prestretch."""
+    """Return the sensor's reconstructor on `GRID`; raise an error if presses cannot determine the prestretch."""
     views = max(1, len(sensor.views))
     expect(views == 1, "calibrate material: views", views, "1: calibrate sensor.in_view(0), the first view by itself")
     sensor.refuse_heights("calibrate material")
@@ -191,7 +198,7 @@ def coarse_reconstructor(sensor: Sensor) -> Reconstructor:
 
 
 def _log_stretch(stretches: np.ndarray, losses: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation of the logarithm of the prestretch, from losses `[S, B]` at `stretches [S]`."""
+    """Return mean and standard deviation of the logarithm of the prestretch, from losses `[S, B]` at `stretches [S]`."""
     z = np.log(stretches)
     fine = np.linspace(z[0], z[-1], FINE)
     loss = PchipInterpolator(z, losses)(fine)

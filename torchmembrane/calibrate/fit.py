@@ -1,4 +1,4 @@
-"""Nonlinear least squares, and what it leaves uncertain."""
+"""Nonlinear least squares with covariance."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,21 +11,21 @@ from torch import Tensor
 from ..errors import MembraneError
 
 TOLERANCE, MOST_STEPS = 1e-7, 200
-LEAST = 1e-13  # smallest singular value that counts as different from zero, over the largest
-OUTLIER = 6.0  # residuals beyond so many robust standard deviations are mistakes, not noise
+LEAST = 1e-13  # smallest singular value that counts as nonzero, over the largest
+OUTLIER = 6.0  # robust standard deviations beyond which a residual is an outlier
 
 
 class Fit(NamedTuple):
-    """The minimum of `|r(theta)|^2` over n unknowns, from m residuals.
+    """The minimum of `|r(theta)|^2` over n unknowns, with m residuals.
 
-    With `J = dr / dtheta` at the minimum and `s^2 = |r|^2 / (m - n)` the covariance is `s^2 (J^T J)^-1`. What the
-    data cannot distinguish shows in it: as huge deviations with correlations near one.
+    With `J = dr / dtheta` at the minimum and `s^2 = |r|^2 / (m - n)`, the covariance is `s^2 (J^T J)^-1`. Parameters that the
+    data cannot identify separately have huge standard deviations and correlations near one.
 
     Attributes:
-        values: `[n]` the unknowns at the minimum.
-        covariance: `[n, n]` of the values.
-        residuals: `[m]` at the minimum.
-        noise: `s`, the standard deviation of one residual.
+        values: the unknowns at the minimum, `[n]`.
+        covariance: covariance of the values, `[n, n]`.
+        residuals: residuals at the minimum, `[m]`.
+        noise: standard deviation of one residual, `s`.
     """
 
     values: np.ndarray
@@ -39,7 +39,7 @@ class Fit(NamedTuple):
         return np.sqrt(np.diag(self.covariance))
 
     def in_degrees(self, count: int) -> "Fit":
-        """The fit with the first `count` motions, each a rotation vector (rad) and a shift, given in degrees and lengths."""
+        """Return the fit with the first `count` motions, each a rotation vector (rad) and a shift, converted to degrees."""
         scale = np.ones(len(self.values))
         scale[: 6 * count].reshape(count, 6)[:, :3] = 180 / np.pi
         return self._replace(values=scale * self.values, covariance=scale[:, None] * self.covariance * scale)
@@ -51,22 +51,22 @@ def fit(
     start: np.ndarray,
     what: str,
 ) -> Fit:
-    """The values that make the sum of squared residuals least, by Levenberg-Marquardt (scipy's trust region).
+    """Minimise the sum of squared residuals by scipy's trust-region method.
 
     Args:
-        residuals: from `theta [n]`, float64, to `[m]`, with m larger than n.
-        jacobian: from `theta [n]` to `[m, n]`.
-        start: `[n]` where to begin.
-        what: names the fit in errors.
+        residuals: function from `theta [n]` (float64) to the residuals `[m]`; m must be larger than n.
+        jacobian: function from `theta [n]` to the derivatives of the residuals, `[m, n]`.
+        start: initial values, `[n]`.
+        what: name of the calibration, for error messages.
 
     Returns:
         The minimum with its covariance.
 
     Raises:
-        MembraneError: too few data, no finite start, or no convergence.
+        MembraneError: there are too few data, residuals at the start are not finite, or the method does not converge.
 
     Limitations:
-        The covariance assumes that residuals are independent and of equal variance, and that what is held fixed is right.
+        The covariance assumes independent residuals of equal variance, and that all parameters held fixed are exact.
 
     Example:
         >>> x = np.arange(5.0)
@@ -90,27 +90,27 @@ def fit(
 
 
 def with_common_errors(found: Fit, jacobian: np.ndarray, errors: np.ndarray) -> Fit:
-    """The fit, its covariance enlarged by K errors that residuals share: `errors [m, K]`, one standard deviation of each.
+    """Add the effect of K errors that residuals share, `errors [m, K]` (one standard deviation each), to the covariance.
 
-    `C + (J^+ E) (J^+ E)^T`: unlike noise, they do not average out over many residuals.
+    The covariance is `C + (J^+ E) (J^+ E)^T`. Unlike noise, shared errors do not average out over many residuals.
     """
     shifts = np.linalg.lstsq(jacobian, errors)[0]
     return found._replace(covariance=found.covariance + shifts @ shifts.T)
 
 
 def outliers(residuals: np.ndarray) -> np.ndarray:
-    """Which of the residual vectors `[N, 2]` are mistakes, far beyond the others: `[N]` bool.
+    """Return which of the residual vectors `[N, 2]` are outliers, `[N]` bool.
 
     Example:
         >>> outliers(np.array([[0.1, 0.0], [0.0, -0.1], [5.0, 0.0], [np.nan, 0.0]]))
         array([False, False,  True,  True])
     """
     length = np.linalg.norm(residuals, axis=-1)
-    return ~(length <= OUTLIER * max(np.nanmedian(length) / 1.18, 1e-9))  # 1.18: median length for unit deviation in the plane
+    return ~(length <= OUTLIER * max(np.nanmedian(length) / 1.18, 1e-9))  # 1.18: median length of planar unit-normal vectors
 
 
 def rotations(vectors: Tensor) -> Tensor:
-    """Rotation matrices of rotation vectors (rad), `[..., 3]` to `[..., 3, 3]`, smooth at 0.
+    """Convert rotation vectors (rad) `[..., 3]` to rotation matrices `[..., 3, 3]`; differentiable at 0.
 
     Example:
         >>> (rotations(torch.tensor([0.0, 0.0, torch.pi / 2])) @ torch.tensor([1.0, 0.0, 0.0])).round().tolist()
@@ -123,10 +123,11 @@ def rotations(vectors: Tensor) -> Tensor:
 
 
 def outline_centres(pixels: Tensor) -> Tensor:
-    """Centres of area `[..., 2]` of outlines in the image `[..., K, 2]`, K even, at equal angles of the dot; K = 1: points.
+    """Return the area centroids `[..., 2]` of outlines in the image, `[..., K, 2]`.
 
-    `c = 2/3 int p (p x p') / int p x p'` about the mean, p' by trigonometric interpolation: exact to high order for dots that
-    are small before their distance, whose outlines are nearly ellipses.
+    K is even, and the K points of an outline are at equal angles of the dot; for K = 1 the points themselves are returned. The
+    centroid is `c = 2/3 int p (p x p') / int p x p'` about the mean, with p' by trigonometric interpolation. It is accurate to
+    high order for dots that are small compared with their distance, whose outlines are nearly ellipses.
 
     Example:
         >>> square = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]], dtype=torch.float64)
@@ -147,7 +148,7 @@ def outline_centres(pixels: Tensor) -> Tensor:
 
 
 def _inverse_gram(jacobian: np.ndarray) -> np.ndarray:
-    """`(J^T J)^-1` by singular values, columns scaled; directions that nothing determines get huge entries, not errors."""
+    """Return `(J^T J)^-1` by an SVD with scaled columns; undetermined directions give huge entries, not errors."""
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0] = 1e-150
     _, singular, V = np.linalg.svd(jacobian / scale, full_matrices=False)

@@ -1,4 +1,4 @@
-"""The membrane's stiffness from a gauge: pressures are proportional to the modulus as forces are."""
+"""The membrane's modulus from a pressure gauge: like forces, pressures are proportional to the modulus."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,18 +7,18 @@ import numpy as np
 
 from ..errors import MembraneError
 
-PRESSURE_ERROR = 0.06  # of a pressure change found, relative (docs/calibration.md)
-GAUGE_ERROR = 0.005  # of a reading, over the rest pressure
-UNSURE = 0.3  # relative standard deviation beyond which readings tell no modulus
-CONTRADICTION = 4.0  # standard deviations that a reading may be off
-LEAST_RESPONSE = 0.3  # of the pressure to the modulus, logarithms: below, a gas follows its volume, whatever the membrane
-STIFFER = 1.1  # modulus with which a gas' response is asked for
+PRESSURE_ERROR = 0.06  # relative standard deviation of a reconstructed pressure change (docs/calibration.md)
+GAUGE_ERROR = 0.005  # standard deviation of a reading, over the rest pressure
+UNSURE = 0.3  # relative standard deviation beyond which readings do not determine a modulus
+CONTRADICTION = 4.0  # largest deviation of a reading, standard deviations
+LEAST_RESPONSE = 0.3  # smallest d log pressure / d log modulus: below, the gas alone determines the pressure
+STIFFER = 1.1  # factor of the modulus with which a gas' response is computed
 ROUNDS = 6
 
 
 class FoundPressures(NamedTuple):
-    """What images show at one modulus: pressure changes since rest and their standard deviations by the markers' noise, `[B]`
-    each, and the rest pressure."""
+    """Pressures reconstructed from images with one modulus: changes since rest and their standard deviations due to the
+    markers' noise, `[B]` each, and the rest pressure."""
 
     change: np.ndarray
     deviation: np.ndarray
@@ -26,7 +26,7 @@ class FoundPressures(NamedTuple):
 
 
 class GaugeModulus(NamedTuple):
-    """The modulus, its standard deviation at the prestretch assumed, and pressure changes found and measured `[B, 2]`."""
+    """The modulus, its standard deviation at the given prestretch, and reconstructed and measured pressure changes `[B, 2]`."""
 
     modulus: float
     deviation: float
@@ -36,22 +36,22 @@ class GaugeModulus(NamedTuple):
 def modulus_from_pressures(
     found: Callable[[float], FoundPressures], readings: np.ndarray, since_rest: bool, modulus: float, gas: bool
 ) -> GaugeModulus:
-    """The modulus that makes the pressure changes found the measured ones, by weighted least squares.
+    """Fit the modulus such that the reconstructed pressure changes equal the measured ones, by weighted least squares.
 
-    Of a liquid, the changes found are proportional to it: `reading = ratio x change`, or where readings are no changes, with
-    what the gauge reads at rest as a second unknown: one image at rest and a pressed one tell both. A gas yields; there it is
-    solved anew with each modulus, `ratio^(1 / response)` times the one before.
+    With a liquid, the reconstructed changes are proportional to the modulus: `reading = ratio x change`. If readings are not
+    changes since rest, the reading at rest is a second unknown; one image at rest and one of a press determine both. With a
+    gas, which is compressible, the presses are solved again for each modulus, `ratio^(1 / response)` times the one before.
 
     Args:
-        found: what the images show with a modulus.
-        readings: `[B]`, force / length^2, NaN where there is none.
-        since_rest: whether they are changes since rest.
-        modulus: to begin with, force / length.
+        found: function from a modulus to the pressures reconstructed with it.
+        readings: gauge readings, `[B]`, force / length^2; NaN where there is none.
+        since_rest: whether readings are changes since rest.
+        modulus: initial modulus, force / length.
         gas: whether the cavity holds a gas.
 
     Raises:
-        MembraneError: nothing is pressed, or too little; the readings contradict the images or one another; a gas' pressure
-            tells its volume, not the membrane.
+        MembraneError: the pressure changes are too small, the readings contradict the images or one another, or a gas' pressure
+            depends on its volume rather than on the membrane.
     """
     known, response = np.isfinite(readings), 1.0
     if gas:
@@ -75,7 +75,7 @@ def modulus_from_pressures(
 
 
 def _line(change: np.ndarray, readings: np.ndarray, sigma: np.ndarray, since_rest: bool) -> tuple[float, float, float]:
-    """Slope of the readings over the changes found, the reading where nothing changes, and the slope's relative deviation."""
+    """Return the slope of readings over reconstructed changes, the reading at no change, and the slope's relative deviation."""
     w = sigma**-2
     centre = 0.0 if since_rest else (w * change).sum() / w.sum()
     information = (w * (change - centre) ** 2).sum()
@@ -96,7 +96,7 @@ def _line(change: np.ndarray, readings: np.ndarray, sigma: np.ndarray, since_res
 
 
 def _response(change: np.ndarray, stiffer: np.ndarray) -> float:
-    """How a gas' pressure changes follow the modulus, by logarithms: 1 as a liquid's, 0 where the gas alone determines them."""
+    """Return d log pressure change / d log modulus: 1 as for a liquid, 0 if the gas alone determines the pressure."""
     response = float(np.log((change * stiffer).sum() / (change**2).sum()) / np.log(STIFFER))
     if not response > LEAST_RESPONSE:
         raise MembraneError(

@@ -1,4 +1,4 @@
-"""A modulus that several measurements tell: forces, a gauge under presses and at rest; joined, and contradictions named."""
+"""The modulus from several measurements: forces, and a gauge during presses and at rest; contradictions are reported."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,20 +14,20 @@ from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from ..sensor.units import hectopascal
 
-REST_ERROR = 0.05  # of the modulus from a gauge at rest, relative: that of the grid and of the reading
-FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
+REST_ERROR = 0.05  # relative standard deviation of the modulus from a gauge at rest, due to the grid and the reading
+FORCE_ERROR = 0.1  # relative standard deviation of force balance on presses of known force (docs/calibration.md)
 PROBABILITY = 0.95  # of intervals
-REACH, SHIFTS = 8.0, 401  # standard deviations of the prestretch to either side, over which probabilities are summed; steps
-FINE = 401  # values between which an interval ends
-CONTRADICTING = 2.5  # standard deviations between two measurements, above which it is said
+REACH, SHIFTS = 8.0, 401  # range of prestretches over which probabilities are summed (standard deviations), and their number
+FINE = 401  # number of values at which the distribution function is computed for an interval
+CONTRADICTING = 2.5  # standard deviations between two measurements above which they contradict one another
 
 
 class KnownPressures(NamedTuple):
-    """What a gauge read.
+    """Readings of a pressure gauge.
 
     Attributes:
-        readings: `[B]` of the images, N per length unit squared, NaN where not known.
-        since_rest: whether these are changes since rest; else what the gauge reads at rest is found as well.
+        readings: the reading for each image, `[B]`, N per length unit squared; NaN if unknown.
+        since_rest: whether readings are changes since rest; if not, the reading at rest is estimated as well.
     """
 
     readings: np.ndarray
@@ -35,11 +35,11 @@ class KnownPressures(NamedTuple):
 
 
 class KnownForces(NamedTuple):
-    """What pressed.
+    """Known forces of presses.
 
     Attributes:
-        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
-        deviations: `[B]` standard deviations of their magnitudes, N; None, or NaN where not known: small beside `FORCE_ERROR`.
+        forces: total force on the membrane, N: `[B, 3]` in the camera's frame, or magnitudes `[B, 1]`; NaN if unknown.
+        deviations: standard deviations of the magnitudes, `[B]`, N; None or NaN: negligible compared with `FORCE_ERROR`.
     """
 
     forces: np.ndarray
@@ -47,23 +47,23 @@ class KnownForces(NamedTuple):
 
     @property
     def relative(self) -> np.ndarray:
-        """Standard deviation of what each known force tells, relative, with `FORCE_ERROR` in it."""
+        """Relative standard deviation of each known force, including `FORCE_ERROR`."""
         size = np.linalg.norm(self.forces, axis=1)
         own = np.zeros_like(size) if self.deviations is None else np.nan_to_num(self.deviations) / size
         return np.hypot(FORCE_ERROR, own)[np.isfinite(size)]
 
 
 class ModulusEvidence(NamedTuple):
-    """What one kind of measurement says of the modulus.
+    """The modulus inferred from one kind of measurement.
 
     Attributes:
-        source: name of the measurement, in words.
+        source: name of the measurement, for messages.
         modulus: shear modulus x thickness, force / length.
-        deviation: standard deviation, at the prestretch found.
-        change: change of the modulus with one standard deviation of the prestretch.
-        by_height: change of the modulus with one standard deviation of the rest surface's height.
-        sides: the modulus with a prestretch one standard deviation lower and higher; its logarithm is then a parabola, else a
-            straight line.
+        deviation: standard deviation of the modulus at the inferred prestretch.
+        change: change of the modulus for one standard deviation of the prestretch.
+        by_height: change of the modulus for one standard deviation of the rest surface's height.
+        sides: the modulus at a prestretch one standard deviation lower and higher. If given, the logarithm of the modulus is
+            modelled as a parabola in the log prestretch; if None, as a straight line.
     """
 
     source: str
@@ -75,15 +75,15 @@ class ModulusEvidence(NamedTuple):
 
 
 class JoinedEvidence(NamedTuple):
-    """Prestretch and modulus by all that is known.
+    """Prestretch and modulus inferred from all measurements.
 
     Attributes:
         shift: shift of the logarithm of the prestretch, in its standard deviations.
-        modulus: force / length.
-        height: height of the rest surface, above what it is, in its standard deviations.
-        covariance: `[3, 3]` of the shift, of the logarithm of the modulus, and of the height.
-        contradictions: a sentence for each two kinds of measurement that contradict one another.
-        intervals: `[2, 2]`, lowest and highest value of the shift, and of the modulus, with a probability of 95 %.
+        modulus: shear modulus x thickness, force / length.
+        height: increase of the rest surface's height over the given one, in its standard deviations.
+        covariance: covariance of shift, logarithm of the modulus, and height, `[3, 3]`.
+        contradictions: a sentence for each pair of measurements that contradict one another.
+        intervals: lower and upper bounds of 95 % intervals of the shift and of the modulus, `[2, 2]`.
     """
 
     shift: float
@@ -100,22 +100,22 @@ def joined(
     height: tuple[float, float] = (0.0, 1.0),
     least: float = -np.inf,
 ) -> JoinedEvidence:
-    """The prestretch's shift `t` and the modulus `m` that several measurements agree on, by weighted least squares:
+    """Find the prestretch's shift `t`, the modulus `m` and the height `h` that fit several measurements, by least squares:
 
         (t - b h)^2 + (h - h0)^2 / s0^2 + sum_i (log m - log m_i(t) - c_i h)^2 / s_i^2,
         log m_i(t) = log m_i + g_i t,    s_i = deviation / modulus,  g_i = change / modulus,  c_i = by_height / modulus
 
-    What the presses' shapes say of the prestretch is the first term. All of it is said at the file's rest surface, which may be
-    higher by `h` of its standard deviations. Each measurement's modulus depends on prestretch and height in its own way, so
-    that two of them tell these, too. Where they cannot agree, the covariance grows by their scatter. Where `log m_i` is a
-    parabola, as of a slack sheet, whose modulus rises ever faster as its prestretch falls to 1, the probability
-    `exp(-least squares / 2)` is summed over `t`.
+    The first term is the prestretch inferred from the shapes of presses. The true rest surface may be higher than the given one
+    by `h` standard deviations. The modulus from each measurement depends differently on prestretch and height, so that two
+    measurements also constrain these. If measurements disagree, the covariance is enlarged by their scatter. If `log m_i` is a
+    parabola (as for a slack sheet, whose modulus grows ever faster as its prestretch approaches 1), the probability
+    `exp(-sum of squares / 2)` is integrated over `t` numerically.
 
     Args:
-        evidence: evidence of each measurement.
-        by_height: `b`, the shift that the presses' shapes tell, with one standard deviation of the height.
-        height: `h0` and `s0`, its mean and standard deviation without the evidence.
-        least: shift that is possible.
+        evidence: the modulus from each measurement.
+        by_height: `b`, the shift inferred from the shapes for one standard deviation of the height.
+        height: `h0` and `s0`, prior mean and standard deviation of the height.
+        least: smallest possible shift.
 
     Example:
         >>> by_force, at_rest = ModulusEvidence("forces", 0.5, 0.05, 0.0), ModulusEvidence("gauge", 0.3, 0.02, 0.0)
@@ -154,8 +154,8 @@ def joined(
 
 
 def normal_interval(deviation: ArrayLike) -> np.ndarray:
-    """How far below and above its mean a normal variable lies with a probability of `PROBABILITY`, `[..., 2]`, from its
-    standard deviation `[..., 1]`.
+    """Return the bounds, relative to the mean, of the interval that a normal variable is in with probability `PROBABILITY`,
+    `[..., 2]`, from its standard deviation `[..., 1]`.
 
     Example:
         >>> normal_interval([1.0]).round(2).tolist()
@@ -169,8 +169,8 @@ def normal_interval(deviation: ArrayLike) -> np.ndarray:
 def _summed(
     evidence: Sequence[ModulusEvidence], rows: np.ndarray, values: np.ndarray, about: tuple[float, float], least: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and covariance of shift, log modulus and height, and what is missed at the mean shift, rows as of `joined`, where
-    logarithms of moduli are parabolas: of each shift the best modulus and height, by least squares, with its probability."""
+    """Return mean and covariance of shift, log modulus and height, and the residuals at the mean shift, if logarithms of moduli
+    are parabolas: at each shift, modulus and height are found by least squares and weighted with the shift's probability."""
     t = _shifts(*about, least)
     best, off, covariance = _best(evidence, rows, values, t)
     weight, x = _probabilities(off), np.column_stack([t, best])
@@ -188,8 +188,8 @@ def _bent_intervals(
     least: float,
     scatter: float,
 ) -> np.ndarray:
-    """Intervals of the shift and of the log modulus, `[2, 2]`, where logarithms of moduli are parabolas and all variances are
-    `scatter` times as large."""
+    """Return the intervals of shift and log modulus, `[2, 2]`, if logarithms of moduli are parabolas and all variances are
+    multiplied by `scatter`."""
     t = _shifts(about[0], about[1] * scatter**0.5, least)
     best, off, covariance = _best(evidence, rows, values, t)
     weight, width = _probabilities(off, scatter), (scatter * covariance[0, 0]) ** 0.5
@@ -197,7 +197,7 @@ def _bent_intervals(
 
 
 def _shifts(middle: float, deviation: float, least: float) -> np.ndarray:
-    """Shifts over which probabilities are summed, `[n]`."""
+    """Return the shifts over which probabilities are summed, `[n]`."""
     t = middle + deviation * np.linspace(-REACH, REACH, SHIFTS)
     return t[t >= least] if (t >= least).any() else np.array([least, least + 1e-9])
 
@@ -205,8 +205,8 @@ def _shifts(middle: float, deviation: float, least: float) -> np.ndarray:
 def _best(
     evidence: Sequence[ModulusEvidence], rows: np.ndarray, values: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log modulus and height that fulfil the rows best at shifts `t [n]`, `[n, 2]`, what they miss, `[n, R]`, and their
-    covariance `[2, 2]` at a shift."""
+    """Return the least-squares log modulus and height at shifts `t [n]`, `[n, 2]`, the residuals of the R rows, `[n, R]`, and
+    the covariance at a given shift, `[2, 2]`."""
     wanted = values - t[:, None] * rows[:, 0]
     for i, one in enumerate(evidence):
         if one.sides:
@@ -220,29 +220,30 @@ def _best(
 
 
 def _probabilities(off: np.ndarray, scatter: float = 1.0) -> np.ndarray:
-    """Of what misses `off [n, R]`, each of variance `scatter`, `[n]`; their sum is 1."""
+    """Return the normalised probabilities `[n]` of residuals `off [n, R]`, each of which has the variance `scatter`."""
     loss = (off**2).sum(1) / (2 * scatter)
     weight: np.ndarray = np.exp(loss.min() - loss)
     return weight / weight.sum()
 
 
 def _interval(weight: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
-    """Lowest and highest value with a probability of `PROBABILITY`, `[2]`, of a mixture of normal distributions about `means
-    [n]` with such weights `[n]`."""
+    """Return the bounds of the interval with probability `PROBABILITY`, `[2]`, of a mixture of normal distributions with
+    these means `[n]`, weights `[n]` and common standard deviation."""
     value = np.linspace(means.min() - REACH * deviation, means.max() + REACH * deviation, FINE)
     below = ndtr((value[:, None] - means) / deviation) @ weight
     return np.interp([(1 - PROBABILITY) / 2, (1 + PROBABILITY) / 2], below, value)
 
 
 def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, float, float]]:
-    """Which of several ratios, whose mean counts, the others contradict: each with its ratio to their mean, and by how much.
+    """Find the ratios that contradict all others.
 
     Args:
-        ratios: `[n]`.
-        deviations: `[n]`, relative.
+        ratios: the ratios, `[n]`.
+        deviations: their relative standard deviations, `[n]`.
 
     Returns:
-        Index, ratio, and standard deviations apart, of each that is more than `CONTRADICTING` apart from the others.
+        For each ratio more than `CONTRADICTING` standard deviations from the mean of the others: its index, its ratio to that
+        mean, and the number of standard deviations.
 
     Example:
         >>> [(i, round(r, 2)) for i, r, _ in odd_ones(np.array([1.0, 1.02, 1.6, 0.98]), np.full(4, 0.1))]
@@ -262,14 +263,14 @@ def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, floa
 def modulus_at_rest(
     sensor: Sensor, log_stretch: float, deviation: float, overpressure: float, other: Sensor | None = None
 ) -> ModulusEvidence:
-    """The modulus that holds the rest surface against what a gauge reads there.
+    """Return the modulus with which the rest surface is in equilibrium with the measured overpressure.
 
     Args:
-        sensor: gives rest surface and material.
+        sensor: the sensor with rest surface and material.
         log_stretch: logarithm of the prestretch.
-        deviation: its standard deviation.
-        overpressure: at rest, hPa.
-        other: the sensor whose rest surface's height differs by one standard deviation.
+        deviation: standard deviation of `log_stretch`.
+        overpressure: gauge reading at rest, hPa.
+        other: the sensor with a rest surface whose height differs by one standard deviation.
     """
     measured = overpressure * hectopascal(sensor.length_unit)
 

@@ -1,6 +1,6 @@
 """The fabrication layout: from the dot pattern wanted in the image, through the ports, to positions on the rest surface.
 
-So the paper made its sensor (section 5.2).
+The paper's sensor was made in this way (section 5.2).
 """
 
 from html import escape
@@ -24,10 +24,10 @@ from .fit import outline_centres
 from .surface import dot_outlines, fine_surface, surface_projection
 
 RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
-MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
+MARGIN = 0.6  # distance of a lattice from the rim's outline, over its pitch
 NEWTON_STEPS, AIMS = 3, 2
-BORDER, STROKE = 0.08, 0.006  # of a drawing, over the rim's extent: what is around the rim, and the rim's line
-DRAWN = 5  # digits of the rim's extent in a drawing
+BORDER, STROKE = 0.08, 0.006  # of a drawing, over the rim's extent: margin around the rim, and width of the rim's line
+DRAWN = 5  # significant digits of the rim's extent in a drawing
 MOST_BYTES = 2**20  # of a file of wanted pixels
 PIXELS = Columns([("u", "v", "size")], "dot", unit="px", most=MOST_DOTS)
 
@@ -36,11 +36,11 @@ class FabricationLayout(NamedTuple):
     """Dots to be made on the rest surface.
 
     Attributes:
-        positions: `[D, 3]` centres, camera frame, length unit.
-        normals: `[D, 3]` outward unit normals there.
-        radii: `[D]`, length unit.
-        sizes: small or large, of each.
-        pixels: `[D, 2]` where they are to be seen, px.
+        positions: centres of the dots, `[D, 3]`, camera's frame, length unit.
+        normals: outward unit normals at the centres, `[D, 3]`.
+        radii: radii of the dots, `[D]`, length unit.
+        sizes: size of each dot, "small" or "large".
+        pixels: wanted positions in the image, `[D, 2]`, px.
     """
 
     positions: np.ndarray
@@ -52,14 +52,14 @@ class FabricationLayout(NamedTuple):
 
 @check_arguments
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
-    """A square lattice in the image about the principal point, within the rim, of large and small dots in turns.
+    """Return a square lattice of alternating large and small dots in the image, centred at the principal point, within the rim.
 
     Args:
-        sensor: camera and rest surface.
-        pitch: pitch of the lattice, px, 4 or more.
+        sensor: the sensor with camera and rest surface.
+        pitch: pitch of the lattice, px, at least 4.
 
     Returns:
-        Pixels `[D, 2]`, and the sizes, small or large, of each.
+        Pixels `[D, 2]`, and the size of each dot, "small" or "large".
 
     Raises:
         MembraneError: the pitch is too small.
@@ -90,20 +90,22 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
 
 @check_arguments
 def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> FabricationLayout:
-    """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels`.
+    """Place dots on the rest surface such that the centroids of their outlines, seen through the ports, are at `pixels`.
 
-    A dot's own centre is seen beside its outline's, so that the ray aimed at is moved until the outline's is right.
+    The image of a dot's centre differs from the centroid of its outline's image, so the ray is adjusted until the centroid is
+    at the wanted pixel.
 
     Args:
-        sensor: camera, with its ports, and rest surface.
-        pixels: `[D, 2]` where the dots are wanted in the image.
-        sizes: small or large, of each.
+        sensor: the sensor with camera, ports and rest surface.
+        pixels: wanted positions of the dots in the image, `[D, 2]`, px.
+        sizes: size of each dot, "small" or "large".
 
     Returns:
         The dots to be made.
 
     Raises:
-        MembraneError: the ray of a pixel misses the surface, the first such pixel is named; or more dots than a sensor lists.
+        MembraneError: the ray of a pixel misses the surface (the message names the first one), or there are more dots than a
+            sensor may list.
 
     Example:
         >>> sensor = Sensor.from_file("examples/sensor.toml")
@@ -131,7 +133,7 @@ def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> F
 
 
 def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays meet the surface, and its normals there, `[D, 3]` each: the mesh first, then Newton on one twice as fine."""
+    """Intersect rays with the surface; return points and normals, `[D, 3]` each, refined by Newton's method on a finer mesh."""
     origin, direction = (ray.numpy() for ray in sensor.camera.pixel_to_ray(torch.from_numpy(pixels)))
     distance = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction)).distance
     missed = ~(np.isfinite(distance) & np.isfinite(direction).all(1))
@@ -150,16 +152,16 @@ def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np
 
 
 def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
-    """A wanted pattern, CSV with the header u,v,size: pixels `[D, 2]` and sizes, small | large.
+    """Read a wanted dot pattern from a CSV file with the header `u,v,size`.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Returns:
-        What `layout_for_pixels` takes.
+        Pixels `[D, 2]` and sizes ("small" or "large"), the arguments of `layout_for_pixels`.
 
     Raises:
-        MembraneError: the file is missing, or not such a table.
+        MembraneError: the file is missing, or is not such a table.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -175,14 +177,14 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
-    """CSV for the machine that makes the dots: `dot,x,y,z,nx,ny,nz,radius,size`.
+    """Write a CSV file for the machine that makes the dots, with columns `dot,x,y,z,nx,ny,nz,radius,size`.
 
-    The origin is at the rim's centre, the axes are parallel to the camera's.
+    The origin is at the rim's centre; the axes are parallel to the camera's.
 
     Args:
-        path: the file.
-        sensor: whose rest surface bears the dots.
-        dots: what to write.
+        path: path of the file.
+        sensor: the sensor on whose rest surface the dots lie.
+        dots: the dots to write.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -205,7 +207,7 @@ def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
 
 
 def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
-    """A drawing of the dots and the rim along the axis, true to size, for printing or looking at; in mm in any unit."""
+    """Write an SVG drawing of dots and rim, seen along the camera's axis, true to scale, in mm for any length unit."""
     one = millimetre(sensor.length_unit)
     rim = sensor.membrane.rest.numpy()[rim_loop(sensor.membrane.grid), :2] / one
     extent = float(np.ptp(rim, 0).max())

@@ -1,4 +1,4 @@
-"""The membrane's prestretch from images of presses, and its stiffness from presses of known force."""
+"""The membrane's prestretch from images of presses, and its modulus from known forces or pressures."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,27 +20,29 @@ from .known_modulus import KnownForces, KnownPressures, ModulusEvidence, joined,
 from .presses import GAS_ROUNDS, LossProfile
 from .rest_error import HEIGHT_ERROR, StatedHeight, changed_height
 
-GAS_SETTLED = 0.1  # change of a gas' modulus, relative, that changes the prestretch by less than its deviation
-# What takes how much of the time, measured: of all, the markers in the images; of a round, the losses with pressures, forces or
-# neither known.
+GAS_SETTLED = 0.1  # relative change of the modulus with a gas that changes the prestretch by less than its deviation
+# Shares of the time, measured: of the markers in the images in the total; of the losses in one round, if pressures, forces or
+# neither are known.
 IMAGES_SHARE, PROFILE_SHARE = 0.05, (0.5, 0.65, 0.85)
 
 
 class MaterialFit(NamedTuple):
-    """The sensor with the material found.
+    """The sensor with its calibrated material.
 
     Attributes:
         sensor: the sensor with this material.
-        values: `[n]` prestretch and, where forces are known, modulus = shear modulus x thickness (N per length unit).
-        covariance: `[n, n]` of the values.
-        intervals: `[n, 2]`, lowest and highest value with a probability of 95 %.
-        profile: the losses on which the prestretch rests.
-        each: `[B, 2]` prestretch and standard deviation from each image alone.
-        forces: `[B, 2]` magnitudes found and measured, N, NaN where not known.
-        pressures: `[B, 2]` changes since rest found and measured, N per length unit squared, NaN where not known.
+        values: prestretch and, if forces or pressures are known, modulus = shear modulus x thickness (N per length unit),
+            `[n]`.
+        covariance: covariance of the values, `[n, n]`.
+        intervals: lower and upper bounds of 95 % intervals of the values, `[n, 2]`.
+        profile: the losses by prestretch from which the prestretch was inferred.
+        each: prestretch and its standard deviation from each image alone, `[B, 2]`.
+        forces: reconstructed and measured magnitudes of forces, `[B, 2]`, N; NaN if unknown.
+        pressures: reconstructed and measured pressure changes since rest, `[B, 2]`, N per length unit squared; NaN if unknown.
         contradictions: sentences about measurements that contradict one another.
-        force_deviation: relative standard deviation of the scale of forces that the sensor then says; None without a modulus.
-        height: `[2]` of an inflated rest surface over its rim, and its standard deviation, length unit; None of any other.
+        force_deviation: relative standard deviation of the scale of reconstructed forces; None without a modulus.
+        height: height of an inflated rest surface over its rim, and its standard deviation, `[2]`, length unit; None for other
+            surfaces.
     """
 
     sensor: Sensor
@@ -72,23 +74,25 @@ def material_from_images(
     rest_error: float = HEIGHT_ERROR,
     progress: Progress = silent,
 ) -> MaterialFit:
-    """Prestretch from images of presses, and the modulus where forces or pressures are known; see `material_from_pixels`.
+    """Infer the prestretch from images of presses, and the modulus from known forces or pressures.
+
+    `material_from_pixels` describes the method.
 
     Args:
-        sensor: the sensor, calibrated but for its material.
-        images: `[B, 1, H, W]` grey in 0..1.
-        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known; or
-            `KnownForces`, with their deviations.
-        pressures: what a gauge read.
-        overpressure: what it read at rest, hPa.
-        rest_error: standard deviation of the rest surface's height over its rim, relative.
-        progress: is told how far it is.
+        sensor: the sensor, calibrated except for its material.
+        images: grey images, `[B, 1, H, W]`, in 0..1.
+        forces: total force on the membrane, N: `[B, 3]` in the camera's frame, or magnitudes `[B, 1]`; NaN if unknown. Or
+            `KnownForces`, with standard deviations.
+        pressures: gauge readings during the presses.
+        overpressure: gauge reading at rest, hPa.
+        rest_error: relative standard deviation of the rest surface's height over its rim.
+        progress: called with the completed share.
 
     Returns:
-        The sensor with the material found.
+        The `MaterialFit`.
 
     Raises:
-        MembraneError: an image shows too few markers, or as of `material_from_pixels`.
+        MembraneError: an image shows too few markers, or as for `material_from_pixels`.
     """
     progress(0.0, f"markers of {len(images)} images")
     reconstructor = coarse_reconstructor(sensor)
@@ -114,40 +118,41 @@ def material_from_pixels(
     rest_error: float = HEIGHT_ERROR,
     progress: Progress = silent,
 ) -> MaterialFit:
-    """Prestretch from presses, and the modulus where their forces, or the pressures in the cavity, are known.
+    """Infer the prestretch from presses, and the modulus from their forces or the pressures in the cavity.
 
-    Force balance is solved at many prestretches l. What it minimises, in standard deviations of the markers and of tractions in
-    units of the rest pressure, less the loss of pushes (`stretch_loss`), is taken for the negative logarithm of a probability:
+    Force balance is solved at many prestretches l. Its objective without the normal-compression term (`stretch_loss`), scaled
+    by the standard deviations of markers and by the rest pressure, is used as a negative log likelihood:
 
         p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of loss(x, p; l)) / mean over l of the same]
 
-    with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
-    where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces
-    that no touch exerts. Forces are proportional to the modulus, so that each press gives the modulus as force measured /
-    force found at modulus 1; their mean is reported. Pressures likewise (`gauge.modulus_from_pressures`).
+    where e = `WRONG` is the probability that an image is explained wrongly. Mean and standard deviation are reported; the
+    latter is enlarged if images contradict one another, and by an error common to all images. With a wrong l, the membrane
+    would need forces that no contact exerts. Forces are proportional to the modulus, so each press gives it as measured force /
+    reconstructed force at modulus 1; the mean is reported. Pressures are used alike (`gauge.modulus_from_pressures`).
 
     Args:
-        sensor: the sensor, calibrated but for its material.
-        pixels: `[B, D, 2]` of the markers in B images of presses (NaN where lost), less what rest images show beside the model.
-        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known; or
-            `KnownForces`, with their deviations.
-        pressures: what a gauge read.
-        overpressure: what it read at rest, hPa.
+        sensor: the sensor, calibrated except for its material.
+        pixels: positions of the markers in B images of presses, `[B, D, 2]` (NaN for lost markers), corrected by the difference
+            between rest image and model.
+        forces: total force on the membrane, N: `[B, 3]` in the camera's frame, or magnitudes `[B, 1]`; NaN if unknown. Or
+            `KnownForces`, with standard deviations.
+        pressures: gauge readings during the presses.
+        overpressure: gauge reading at rest, hPa.
         noise: noise of the pixels, as for `Reconstructor.from_pixels`.
-        rest_error: standard deviation of the rest surface's height over its rim, relative.
-        progress: is told how far it is.
+        rest_error: relative standard deviation of the rest surface's height over its rim.
+        progress: called with the completed share.
 
     Returns:
-        The sensor with the material found.
+        The `MaterialFit`.
 
     Raises:
-        MembraneError: the sensor's material is harmonic: its shape does not depend on the prestretch; both forces and
-            pressures; an open cavity, or pressures that tell no modulus.
+        MembraneError: the material is harmonic, so that its shape does not depend on the prestretch; a press with a known force
+            hardly shows; or the gauge readings do not determine a modulus, as with an open cavity.
 
     Limitations:
-        Shallow presses, or presses that the markers miss, identify little (the deviation is large then). The membrane must be
-        equally stretched in both directions, and the rest surface right. A prestretch outside `STRETCHES` is found near their
-        end.
+        Shallow presses, and presses between markers, carry little information (the standard deviation is then large). The
+        prestretch must be equibiaxial, and the rest surface accurate. A prestretch outside the range of `STRETCHES` is found
+        near its end.
     """
     reconstructor = coarse_reconstructor(sensor)
     pixels = tensor_of("calibrate material: pixels", pixels).to(reconstructor.rest_pixels)
@@ -195,9 +200,9 @@ def _material(
 
 
 class _Found(NamedTuple):
-    """What one round finds: values, covariance and intervals as of `MaterialFit`, the forces' relative standard deviation (None
-    without a modulus), sentences, and the rest surface's height above what it was, and its standard deviation, in those stated.
-    """
+    """Result of one round: values, covariance and intervals as in `MaterialFit`, the relative standard deviation of forces
+    (None without a modulus), contradictions, and the change of the rest surface's height with its standard deviation, both in
+    stated standard deviations."""
 
     values: np.ndarray
     covariance: np.ndarray
@@ -227,7 +232,7 @@ def _found(at: ExplainedPresses, evidence: "_Evidence") -> _Found:
 
 
 def _with_own_markers(fit: MaterialFit, sensor: Sensor) -> MaterialFit:
-    """The fit's sensor with the markers of the sensor's file, on the rest surface found."""
+    """Return the fit with the markers of the given sensor, moved to the fitted rest surface."""
     surface, material = fit.sensor.surface, fit.sensor.material
     if not isinstance(surface, InflatedSurface) or not isinstance(sensor.surface, InflatedSurface):
         return fit
@@ -242,8 +247,8 @@ def _with_own_markers(fit: MaterialFit, sensor: Sensor) -> MaterialFit:
 
 
 class _Evidence:
-    """What forces and gauges tell of the modulus: `found`; magnitudes and pressures found and measured, `[B, 2]`, NaN where not
-    known; sentences about measurements that the others contradict."""
+    """The modulus from forces and gauges (`found`), reconstructed and measured magnitudes and pressures, `[B, 2]`, NaN if
+    unknown, and sentences about measurements that contradict the others (`said`)."""
 
     def __init__(self, at: ExplainedPresses) -> None:
         self.presses, self.other, self.by, self.reach = at.presses, at.other, at.by, at.height.reach
@@ -253,7 +258,7 @@ class _Evidence:
         self.said: list[str] = []
 
     def gather(self, known: MeasuredPresses, progress: Progress) -> None:
-        """From what is known."""
+        """Compute the modulus from each known kind of measurement."""
         if known.forces is not None:
             modulus, sd, change, sides, self.magnitudes, odd = self.presses.modulus(*self.at, known.forces, progress)
             self._add(ModulusEvidence("the forces", modulus, sd, change, -self.by.by_height * modulus, sides))
@@ -275,16 +280,16 @@ class _Evidence:
 
 
 def _shares(sensor: Sensor, with_modulus: bool, rounds: int, progress: Progress) -> tuple[Progress, Progress]:
-    """The progress of one round and of those after it: a gas' modulus, first unknown, is expected to settle in the second; the
-    rounds of an inflated surface are looked after by themselves."""
+    """Return the progress of this round and of the later ones. With a gas and an initially unknown modulus, two rounds are
+    expected; an inflated surface has rounds of its own."""
     again = sensor.cavity.filling == "gas" and with_modulus and rounds == GAS_ROUNDS and sensor.force_unit == "relative"
     share = 0.5 if again and not isinstance(sensor.surface, InflatedSurface) else 1.0
     return within(progress, 0.0, share), within(progress, share, 1.0)
 
 
 def _is_settled(sensor: Sensor, made: Sensor) -> bool:
-    """Whether the presses were explained with about the modulus found; without one a gas acts as a liquid, whose shape does not
-    depend on it."""
+    """Return whether the presses were solved with about the modulus found. Only with a gas do shapes depend on the modulus; a
+    gas without modulus is treated as a liquid."""
     if made.cavity.filling != "gas" or made.force_unit == "relative":
         return True
     return sensor.force_unit != "relative" and abs(made.material.modulus / sensor.material.modulus - 1) < GAS_SETTLED

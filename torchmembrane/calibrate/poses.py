@@ -1,4 +1,4 @@
-"""First poses of a board before a camera, by OpenCV: with a first lens, or through the designed ports."""
+"""Initial poses of a board relative to a camera, by OpenCV: together with an initial lens, or through the designed ports."""
 
 import numpy as np
 import torch
@@ -13,12 +13,12 @@ from .fit import Fit, fit, rotations
 
 
 def lens_and_poses(camera: Camera, board: Checkerboard, pixels: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """A first lens, and poses `[P, 6]` (rotation vectors and translations), from the board's `pixels [P, D, 2]` in air.
+    """Find an initial lens, and poses `[P, 6]` (rotation vectors and translations), from the board's `pixels [P, D, 2]` in air.
 
-    It has as many coefficients as the camera, or all of its model's.
+    The lens has as many distortion coefficients as the camera, but at least those of its model.
 
     Raises:
-        MembraneError: fewer than 3 images, or OpenCV finds no lens of the camera's model.
+        MembraneError: there are fewer than 3 images, or OpenCV finds no lens of the camera's model.
     """
     cv2 = load_opencv()
     if len(pixels) < 3:
@@ -44,12 +44,12 @@ def lens_and_poses(camera: Camera, board: Checkerboard, pixels: np.ndarray) -> t
 
 
 def port_pose(camera: Camera, board: DotBoard, pixels: np.ndarray) -> np.ndarray:
-    """A first pose `[6]` of the board, seen through the designed ports: the better of the two that a central camera allows.
+    """Find an initial pose `[6]` of the board seen through the designed ports: the better of the two planar solutions.
 
     Args:
-        camera: the camera with its ports, and with what is behind them as its medium.
+        camera: the camera with its ports; its medium is what is behind the last one.
         board: the board.
-        pixels: `[D, 2]` where its dots are, px, NaN where not visible.
+        pixels: positions of its dots, `[D, 2]`, px; NaN where a dot is not visible.
 
     Raises:
         MembraneError: fewer than 6 dots are visible.

@@ -1,4 +1,4 @@
-"""Presses as measured, explained by one material or another: what each prestretch costs, and which modulus forces tell."""
+"""Measured presses, solved with different materials: the loss at each prestretch, and the modulus from forces or pressures."""
 
 from typing import NamedTuple
 
@@ -17,20 +17,20 @@ from .known_modulus import KnownForces, KnownPressures, odd_ones
 from .rest_error import PressesTold, at_other_height, changed_height
 from .stretch_loss import Explained, continued
 
-PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
-STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
-BETWEEN = 5  # prestretches tried on either side of the lowest
+PRESSURE_GRID = (33, 33)  # on coarser grids pressure changes are wrong by up to a tenth
+STRETCHES = np.geomspace(1.01, 2.0, 10)  # at larger prestretches the shape hardly depends on the prestretch
+BETWEEN = 5  # number of prestretches tried around the one of lowest loss
 GAS_ROUNDS = 4
-MODULUS_SETTLED = 1e-3  # change of a gas' modulus, relative, that changes the forces by less than a thousandth
-CONTINUED = 0.1  # of a solve from rest takes each step from a neighbour's solution, measured
+MODULUS_SETTLED = 1e-3  # relative change of the modulus with a gas that changes forces by less than a thousandth
+CONTINUED = 0.1  # time of a continuation from a neighbouring prestretch, over that of a solve from rest, measured
 
 
 class LossProfile(NamedTuple):
-    """The least loss at each prestretch.
+    """The lowest loss at each prestretch.
 
     Attributes:
-        stretches: `[S]` prestretches, increasing.
-        losses: `[S, B]` of every image.
+        stretches: the prestretches, `[S]`, increasing.
+        losses: the loss of each image, `[S, B]`.
     """
 
     stretches: np.ndarray
@@ -38,13 +38,13 @@ class LossProfile(NamedTuple):
 
 
 class Presses:
-    """B presses as measured, to be explained by one material or another.
+    """B measured presses, which can be solved with different materials.
 
     Args:
-        reconstructor: the sensor's.
-        displacement: `[B, D, 2]` of its markers, px.
-        confidence: `[B, D]` of its markers.
-        covariance: `[B, D, 2, 2]` of the displacements, px^2; default: the rest image's.
+        reconstructor: the sensor's reconstructor.
+        displacement: displacements of its markers, `[B, D, 2]`, px.
+        confidence: confidence of its markers, `[B, D]`.
+        covariance: covariance of the displacements, `[B, D, 2, 2]`, px^2; default: twice the rest image's.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class Presses:
         self.observation = reconstructor.observation(*self.measured)
 
     def at_other_height(self, share: float) -> "Presses":
-        """The same markers where the rest surface's height differs by a share."""
+        """Return the presses on a rest surface whose height differs by this share; see `rest_error.at_other_height`."""
         return self._on(*at_other_height(self.reconstructor.sensor, self.rest_markers, share))
 
     def at_height(self, share: float) -> "Presses":
-        """The same markers where an inflated rest surface is higher by a share."""
+        """Return the presses on a rest surface that is higher by this share; see `rest_error.changed_height`."""
         return self._on(*changed_height(self.reconstructor.sensor, self.rest_markers, share))
 
     @property
@@ -70,11 +70,11 @@ class Presses:
         return positions
 
     def _on(self, sensor: Sensor, kept: np.ndarray) -> "Presses":
-        """Presses of a sensor that has some of the markers."""
+        """Return the presses for a sensor with a subset of the markers, `kept` `[D]` bool."""
         return Presses(Reconstructor(sensor, dtype=torch.float64, check_rest=False), *(a[:, kept] for a in self.measured))
 
     def explained(self, stretch: float, modulus: float, grid: tuple[int, int] | None = None) -> Explained:
-        """The estimator with this material, on this grid, default the reconstructor's, and what it finds."""
+        """Return the estimator with this material on this grid (default: the reconstructor's), and its solution."""
         r, known = self.reconstructor, self.reconstructor.estimator
         assert isinstance(known, ForceBalance)  # as `_reconstructor` chooses
         cavity, membrane = known.cavity, known.membrane if grid is None else r.sensor.surface.membrane(grid)
@@ -88,12 +88,12 @@ class Presses:
             return estimator, estimator(self.observation)
 
     def profile_at(self, stretches: np.ndarray, progress: Progress) -> LossProfile:
-        """The presses' losses at given prestretches."""
+        """Return the losses of the presses at given prestretches."""
         solutions = self._solutions(stretches, within(progress, 0.0, 1 - CONTINUED))
         return self._profile(solutions, within(progress, 1 - CONTINUED, 1.0))
 
     def profile(self, progress: Progress) -> LossProfile:
-        """The presses' losses at `STRETCHES`, and closer together around the lowest."""
+        """Return the losses of the presses at `STRETCHES`, and at further prestretches around the one of lowest loss."""
         work = np.array([len(STRETCHES), CONTINUED * len(STRETCHES), BETWEEN, CONTINUED * (len(STRETCHES) + BETWEEN)])
         ends = np.cumsum([0.0, *work / work.sum()]).tolist()
         solve, follow, solve_between, follow_all = (within(progress, *pair) for pair in zip(ends, ends[1:], strict=False))
@@ -104,7 +104,7 @@ class Presses:
         return self._profile(solutions | self._solutions(between, solve_between), follow_all)
 
     def _solutions(self, stretches: np.ndarray, progress: Progress) -> dict[float, Explained]:
-        """What explains the presses at each prestretch, solved from rest."""
+        """Return the solutions at each prestretch, solved from rest."""
         modulus, found = self.reconstructor.sensor.material.modulus, {}
         for k, stretch in enumerate(stretches):
             progress(k / len(stretches), f"force balance at prestretch {stretch:.3g}")
@@ -118,7 +118,7 @@ class Presses:
         return LossProfile(np.array(stretches), np.array([(seen * found.unexplained).numpy() for _, found in best]))
 
     def told(self, log_stretches: np.ndarray) -> PressesTold:
-        """Losses and forces at these prestretches."""
+        """Return losses and forces at these log prestretches."""
         explained = [self.explained(float(np.exp(z)), self.reconstructor.sensor.material.modulus) for z in log_stretches]
         losses = np.array([float((self.observation.confidence.sum(-1) * found.unexplained).sum()) for _, found in explained])
         return PressesTold(losses, np.stack([np.linalg.norm(_forces(each), axis=1) for each in explained]))
@@ -131,8 +131,11 @@ class Presses:
         other: "Presses | None" = None,
         progress: Progress = silent,
     ) -> tuple[float, float, float, float, np.ndarray]:
-        """The modulus from pressures; arguments and what is returned as of `modulus`, with pressure changes for forces, and
-        before these the change on the rest surface of another height."""
+        """Return the modulus from gauge readings.
+
+        Args and results are like those of `modulus`: the modulus, its standard deviation at this prestretch, its change for one
+        deviation of the prestretch, its change on the rest surface of another height, and the pressure changes, `[B, 2]`.
+        """
         modulus = self.reconstructor.sensor.material.modulus
         progress(0.0, "modulus from pressures")
         fitted = self._gauge_fit(np.exp(log_stretch), modulus, pressures)
@@ -162,21 +165,21 @@ class Presses:
     def modulus(
         self, log_stretch: float, deviation: float, known: KnownForces, progress: Progress = silent
     ) -> tuple[float, float, float, tuple[float, float], np.ndarray, list[tuple[int, float, float]]]:
-        """The modulus from presses of known force.
+        """Return the modulus from presses of known force.
 
-        A gas resists in newtons: there the presses are explained anew with each modulus.
+        A gas has a stiffness in newtons, so with a gas the presses are solved again for each modulus.
 
         Args:
             log_stretch: logarithm of the prestretch.
-            deviation: its standard deviation.
-            known: as for `material_from_pixels`.
-            progress: is told how far it is.
+            deviation: standard deviation of `log_stretch`.
+            known: the known forces.
+            progress: called with the completed share.
 
         Returns:
-            The modulus; its standard deviation at this prestretch; its change with one deviation of the prestretch, the larger
-            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; the moduli on
-            either side; magnitudes of the forces found and measured, `[B, 2]`; and images whose forces the others contradict,
-            as of `odd_ones`.
+            The modulus; its standard deviation at this prestretch; its change for one deviation of the prestretch, the larger
+            of the two sides and negative, because a membrane under more tension at rest needs a smaller modulus for the same
+            force; the moduli on either side; reconstructed and measured magnitudes of forces, `[B, 2]`; and the images whose
+            forces contradict the others, as returned by `odd_ones`.
         """
         forces, relative = known.forces, known.relative
         weight = relative**-2.0 / (relative**-2.0).sum()
@@ -199,7 +202,7 @@ class Presses:
         return modulus, modulus * sure * max(1.0, scatter) ** 0.5, change, (low, high), magnitudes, odd
 
     def _refuse_unpressed(self, stretch: float, modulus: float, known: np.ndarray) -> None:
-        """Refuse images of known force `[B]` in which the markers show hardly any."""
+        """Raise an error if an image of known force (mask `[B]`) hardly shows a force."""
         estimator, it = self.explained(stretch, modulus)
         noise = estimator.equations.bearings.noise
         with torch.no_grad():
@@ -213,7 +216,8 @@ class Presses:
             )
 
     def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Forces measured over found of the presses of known force `[F]`, and all magnitudes, found and measured `[B, 2]`."""
+        """Return measured over reconstructed force for presses of known force, `[F]`, and reconstructed and measured magnitudes
+        of all presses, `[B, 2]`."""
         found = _forces(self.explained(stretch, modulus))
         size, measured = np.linalg.norm(found, axis=1), np.linalg.norm(forces, axis=1)
         along = (forces * found).sum(1) / size if forces.shape[1] == 3 else measured
@@ -221,7 +225,7 @@ class Presses:
 
 
 def _forces(explained: Explained) -> np.ndarray:
-    """Found in presses, `[B, 3]`."""
+    """Return the reconstructed forces, `[B, 3]`."""
     estimator, equilibrium = explained
     found: np.ndarray = (equilibrium.traction * estimator.membrane.rest_area[:, None]).sum(1).numpy()
     return found

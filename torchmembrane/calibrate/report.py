@@ -1,4 +1,4 @@
-"""What a calibration found: values with standard deviations and correlations, as text and as JSON."""
+"""Report of a calibration: values with standard deviations and correlations, as text and as JSON."""
 
 import json
 from collections.abc import Sequence
@@ -11,21 +11,21 @@ from numpy.typing import ArrayLike
 from ..files.atomic import make_folder, write_text
 from ..files.digits import decimals
 
-FINEST = 1e-6  # of a value: smaller deviations give it no more digits
-HIGH_CORRELATION = 0.95  # above it two parameters are said to be hard to identify separately
+FINEST = 1e-6  # smallest relative deviation for the number of digits of a value
+HIGH_CORRELATION = 0.95  # correlation above which two parameters are reported as hard to identify separately
 
 
 class Estimate(Protocol):
-    """What a report takes from a fit, such as `calibrate.Fit`."""
+    """The members of a fit, such as `calibrate.Fit`, that a report uses."""
 
     @property
     def values(self) -> np.ndarray:
-        """The unknowns as found, `[n]`."""
+        """Fitted values of the unknowns, `[n]`."""
         ...
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of the values, `[n, n]`."""
+        """Covariance of the values, `[n, n]`."""
         ...
 
     @property
@@ -40,21 +40,21 @@ class Estimate(Protocol):
 
 
 class Report(NamedTuple):
-    """A calibration's values, how sure they are, and the residuals that they leave.
+    """Values of a calibration with their uncertainty, and the residuals.
 
     Attributes:
-        title: what was calibrated.
-        names: `[n]`, the parameters.
-        units: `[n]`, theirs.
-        design: `[n]`, their values before.
-        values: `[n]`, as found.
-        deviations: `[n]`, standard deviations.
-        correlations: `[n, n]`.
-        pixels: `[N, 2]` px, of all points used.
-        residuals: `[N, 2]` px, there.
+        title: name of the calibration.
+        names: names of the n parameters.
+        units: units of the parameters.
+        design: values of the parameters before the calibration, `[n]`.
+        values: fitted values, `[n]`.
+        deviations: standard deviations of the values, `[n]`.
+        correlations: correlations of the values, `[n, n]`.
+        pixels: pixels of the N points used, `[N, 2]`.
+        residuals: residuals of these points, `[N, 2]`, px.
         noise: standard deviation of one residual, px.
-        notes: lines for people.
-        intervals: `[n, 2]`, lowest and highest value with a probability of 95 %; None: not told.
+        notes: further lines of text.
+        intervals: lower and upper bounds of 95 % intervals of the values, `[n, 2]`; None: not computed.
 
     Example:
         >>> none = np.zeros((0, 2))
@@ -90,7 +90,7 @@ class Report(NamedTuple):
         residuals: np.ndarray,
         notes: Sequence[str] = (),
     ) -> "Report":
-        """From a `Fit` whose first parameters are those of `names`; pixels and residuals `[..., 2]`, NaN where not used."""
+        """Make a report of a fit whose first parameters are `names`; `residuals [..., 2]` are NaN for points not used."""
         n = len(names)
         covariance, deviations = fit.covariance[:n, :n], fit.deviations[:n]
         correlations = covariance / np.maximum(np.outer(deviations, deviations), 1e-300)
@@ -111,13 +111,13 @@ class Report(NamedTuple):
 
     @classmethod
     def without_parameters(cls, title: str, notes: Sequence[str] = ()) -> "Report":
-        """Of a calibration that gives a surface, and no parameters."""
+        """Make a report of a calibration that has no parameters, only a surface."""
         numbers, none = np.zeros(0), np.zeros((0, 2))
         return cls(title, [], [], numbers, numbers, numbers, np.zeros((0, 0)), none, none, 0.0, list(notes))
 
     @property
     def confounded(self) -> list[tuple[str, str, float]]:
-        """Pairs of parameters that the data hardly identify separately, with their correlation."""
+        """Pairs of parameters that the data can hardly identify separately, with their correlation."""
         rows, columns = np.nonzero(np.triu(np.abs(self.correlations) > HIGH_CORRELATION, 1))
         return [(self.names[i], self.names[j], float(self.correlations[i, j])) for i, j in zip(rows, columns, strict=True)]
 
@@ -141,11 +141,11 @@ class Report(NamedTuple):
 
     @property
     def _intervals(self) -> dict[str, list[float]]:
-        """Of each parameter, by its name, where they are told."""
+        """Interval of each parameter by its name; empty if intervals were not computed."""
         return {} if self.intervals is None else dict(zip(self.names, self.intervals.tolist(), strict=True))
 
     def write(self, folder: Path) -> None:
-        """Write `report.json` in the folder, which is made if need be."""
+        """Write `report.json` to a folder, which is created if it does not exist."""
         rows = zip(self.names, self.values, self.deviations, self.units, self.design, strict=True)
         parameters: dict[str, dict[str, Any]] = {n: dict(value=v, deviation=s, unit=u, before=b) for n, v, s, u, b in rows}
         for name, interval in self._intervals.items():

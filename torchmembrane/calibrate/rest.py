@@ -1,4 +1,4 @@
-"""Pose of the rest surface before the camera, and the dots on it, from one rest image (section 5.2)."""
+"""Pose of the rest surface relative to the camera, and the dots on it, from one rest image (section 5.2)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,22 +22,23 @@ from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_err
 from .surface import dot_outlines, fine_surface, frames_at, recalibrated, unit_shapes
 
 NAMES = ["tilt_x", "tilt_y", "tilt_z", "offset_x", "offset_y", "offset_z"]
-BIAS = 0.03  # px, outwards: of located dots on a shaded surface, the same for all of them (up to 0.026 px, docs/calibration.md)
-PRESSED = 4e-4  # of the image's diagonal: rms that neighbouring dots have in common of what no pose explains
+BIAS = 0.03  # px, common outward shift of located dots on a shaded surface (up to 0.026 px, docs/calibration.md)
+PRESSED = 4e-4  # largest rms of the residuals that neighbouring dots share, over the image's diagonal
 NEIGHBOURS = 6
 GUESS = 0.02  # radius of a dot before it is measured, over the surface's size
 
 
 class RestFit(NamedTuple):
-    """The sensor with its surface and dots where one image shows them.
+    """The sensor with surface and dots found in one image.
 
     Attributes:
         sensor: the sensor with the pose and dots found.
-        names: names of the six numbers of the pose.
-        fit: fit of the pose, from the design: rotation vector about the rim's centre (degrees), and offset (length unit).
-        pixels: `[D, 2]` px, measured centres of the dots' outlines, NaN where not visible.
-        residuals: `[D, 2]` px, measured less modelled by the pose alone.
-        shifts: `[D, 3]` by which the dots were then moved along the surface to null the residuals.
+        names: names of the parameters of the fit: six of the pose, and for an inflated surface height and prestretch.
+        fit: fit of the pose relative to the design: rotation vector about the rim's centre (degrees), and offset (length
+            unit); for an inflated surface also of height and prestretch.
+        pixels: measured centres of the dots' outlines, `[D, 2]`, px; NaN where a dot is not visible.
+        residuals: measured minus modelled pixels after the fit of the pose, `[D, 2]`.
+        shifts: subsequent shifts of the dots along the surface that null the residuals, `[D, 3]`, length unit.
     """
 
     sensor: Sensor
@@ -52,26 +53,26 @@ class RestFit(NamedTuple):
 def rest_from_image(
     sensor: Sensor, image: np.ndarray, overpressure: float | None = None, *, progress: Progress = silent
 ) -> RestFit:
-    """Pose of the rest surface, then each dot's position on it, from a rest image of listed dots.
+    """Find the pose of the rest surface, then each dot's position on it, in a rest image of listed dots.
 
-    The pose is the one from which the camera sees the listed dots where they are measured; what is left is taken for errors of
-    the dots' positions and nulled by moving them within the surface.
+    The pose minimises the distances of the listed dots from their measured pixels. The remaining residuals are attributed to
+    errors of the dots' positions and are nulled by moving the dots within the surface.
 
     Args:
         sensor: the design, with a list of dots.
-        image: `[H, W]` the membrane at rest, grey in 0..1.
-        overpressure: that a gauge reads at rest, hPa; of an inflated surface alone.
-        progress: is told how far it is.
+        image: grey image of the membrane at rest, `[H, W]`, in 0..1.
+        overpressure: gauge reading at rest, hPa; for inflated surfaces only.
+        progress: called with the completed share.
 
     Returns:
-        The sensor with pose and dots found, and the fit; of an inflated surface its height and prestretch, too.
+        The `RestFit`; for an inflated surface, height and prestretch are fitted as well.
 
     Raises:
         MembraneError: the sensor lists no dots, or fewer than 8 of them are found.
 
     Limitations:
-        The surface must have the designed shape; where it has another, or something presses it, a warning says so, unless
-        neighbouring dots move in common by less than `PRESSED` of the image's diagonal: use several views or a depth image.
+        The surface must have the designed shape. If it has another shape or is in contact, a warning is issued, except if the
+        common shift of neighbouring dots is below `PRESSED` of the image's diagonal; use several views or a depth image then.
 
     Example:
         >>> from dataclasses import replace
@@ -140,11 +141,11 @@ def _refuse_gauge(sensor: Sensor, overpressure: float | None) -> None:
 
 
 def common_residual(pixels: np.ndarray, residuals: np.ndarray) -> float:
-    """What neighbouring dots have in common of their residuals, rms, px: `sqrt(mean_d r_d . mean_n r_n)`, 0 where they differ.
+    """Return the rms of the residuals that neighbouring dots share, px: `sqrt(mean_d r_d . mean_n r_n)`, 0 if uncorrelated.
 
     Args:
-        pixels: `[D, 2]` px.
-        residuals: there, `[D, 2]` px.
+        pixels: pixels of the dots, `[D, 2]`.
+        residuals: their residuals, `[D, 2]`, px.
 
     Example:
         >>> pixels = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
@@ -156,7 +157,7 @@ def common_residual(pixels: np.ndarray, residuals: np.ndarray) -> float:
 
 
 def warn_of_press(sensor: Sensor, pixels: np.ndarray, residuals: np.ndarray) -> None:
-    """Say where `residuals [D, 2]` at `pixels [D, 2]` are a displacement of the surface, not errors of single dots."""
+    """Warn if `residuals [D, 2]` at `pixels [D, 2]` are due to a displacement of the surface, not to errors of single dots."""
     common, limit = common_residual(pixels, residuals), PRESSED * float(np.hypot(*sensor.camera.image_size))
     if common > limit:
         warn_user(
@@ -167,7 +168,7 @@ def warn_of_press(sensor: Sensor, pixels: np.ndarray, residuals: np.ndarray) -> 
 
 
 def shading_bias(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """One standard deviation of the error that dots located at `pixels [..., 2]` share, `[..., 2]` px."""
+    """Return one standard deviation of the error that dots located at `pixels [..., 2]` share, `[..., 2]` px."""
     outwards = pixels - camera.centre.numpy()
     return BIAS * outwards / np.linalg.norm(outwards, axis=-1, keepdims=True).clip(1)
 
@@ -180,18 +181,18 @@ def measured_outlines(
     image: np.ndarray,
     camera_points: Callable[[np.ndarray], np.ndarray] = np.asarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Dots as large as an image shows them, and where it shows them.
+    """Measure sizes and positions of dots in an image.
 
     Args:
-        sensor: camera and polarity of the dots.
-        surface: the surface that the dots are on.
-        X: `[D, 3]` the dots' centres on it.
-        sizes: `[D]` 1 for a large dot, 0 for a small one.
-        image: `[H, W]` grey in 0..1.
-        camera_points: from the surface's frame to that of the image's camera, where it is another.
+        sensor: the sensor with the camera and the polarity of the dots.
+        surface: the surface on which the dots lie.
+        X: centres of the dots on the surface, `[D, 3]`.
+        sizes: 1 for a large dot, 0 for a small one, `[D]`.
+        image: grey image, `[H, W]`, in 0..1.
+        camera_points: function that maps points of the surface's frame to the frame of the image's camera, if they differ.
 
     Returns:
-        Outlines `[D, 8, 3]` in the surface's frame, and measured centres `[D, 2]` px, NaN where not visible.
+        Outlines `[D, 8, 3]` in the surface's frame, and measured centres `[D, 2]`, px; NaN where a dot is not visible.
 
     Raises:
         MembraneError: fewer than 8 dots are found.
@@ -209,7 +210,7 @@ def measured_outlines(
 
 
 def nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Shifts `[D, 3]` within the tangent plane after which each visible dot is modelled where it is measured; else 0."""
+    """Return the tangential shifts `[D, 3]` that make the modelled pixel of each visible dot equal the measured one; else 0."""
     outline, tangent, target = (torch.from_numpy(np.ascontiguousarray(a[visible])) for a in (outlines, tangents, pixels))
 
     def modelled(step: Tensor, outline: Tensor, tangent: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""How sure a rest surface is: the sensor whose surface has another height over its rim, and what presses tell then.
+"""Uncertainty of the rest surface: the sensor with another height of its surface, and the effect on inferences from presses.
 
-Dots that were placed from the rest image lie on its rays whatever the surface: they are moved along these. What the image
-leaves open is mostly one number, how high the surface stands over its rim.
+Dots that were placed from the rest image lie on its rays whatever the surface is, so they are moved along these rays. A rest
+image leaves mainly one number undetermined, the height of the surface over its rim.
 """
 
 from dataclasses import dataclass, replace
@@ -18,24 +18,24 @@ from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 
 HEIGHT_ERROR = 0.05
-"""Standard deviation of the rest surface's height over its rim, relative, where nothing is said of it."""
+"""Default relative standard deviation of the rest surface's height over its rim."""
 MOST_ERROR = 0.5
 LEAST_HEIGHT_ERROR = 0.03
-"""Standard deviation of the height that presses tell, relative, however little noise there is: the grid's and the model's."""
-SETTLED = 1.0  # of its standard deviation that the height may still change by
-LEAST_REACH, LOWEST = 0.1, 0.5  # of a step of the height, in stated standard deviations; of a height over the one before
-SHRINKING = 0.6  # of the reach from one round to the next, at least
-MOST_SHIFT = 3.0  # of the prestretch by the height, in standard deviations by the losses: beyond, a loss is no parabola
+"""Smallest relative standard deviation of a height inferred from presses, due to the grid and the model."""
+SETTLED = 1.0  # largest last change of the height, over its standard deviation
+LEAST_REACH, LOWEST = 0.1, 0.5  # smallest step of the height, in stated standard deviations; smallest ratio of heights
+SHRINKING = 0.6  # largest ratio of the reach from one round to the next
+MOST_SHIFT = 3.0  # largest shift of the prestretch by the height, standard deviations: beyond, the loss is not a parabola
 
 
 @dataclass(frozen=True, eq=False)
 class _Scaled(Surface):
-    """A surface whose heights over its rim's plane are larger by a share."""
+    """A surface whose heights over its rim's plane are scaled by `1 + share`."""
 
     share: float = 0.0
 
     def membrane(self, grid: tuple[int, int]) -> Membrane:
-        """On a solver grid; see `Surface.membrane`."""
+        """Return the surface on a solver grid; see `Surface.membrane`."""
         membrane = super().membrane(grid)
         x, fixed = (a.unflatten(0, grid).numpy() for a in (membrane.rest, membrane.fixed))
         rim = membrane.rest.numpy()[rim_loop(grid)]
@@ -45,17 +45,17 @@ class _Scaled(Surface):
 
 
 def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
-    """The sensor with a rest surface that is lower above its rim by a share, and markers where their rays meet it.
+    """Lower the rest surface of a sensor by a share of its height over the rim, and move the markers along their rays.
 
-    A surface that folds when it is lowered is raised instead; all effects of the small change then have the opposite sign.
+    A surface that would fold when lowered is raised instead; all effects of the small change then have the opposite sign.
 
     Args:
-        sensor: any.
-        positions: `[D, 3]` of its markers.
-        share: share of the height.
+        sensor: the sensor.
+        positions: positions of its markers, `[D, 3]`.
+        share: relative change of the height.
 
     Returns:
-        The sensor, without a rest image, and which markers it has, `[D]` bool: the rays of the others miss the surface.
+        The sensor, without a rest image, and the mask of the markers kept, `[D]` bool; rays of the others miss the surface.
 
     Raises:
         MembraneError: the surface folds either way.
@@ -74,7 +74,7 @@ def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tupl
 
 
 def changed_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
-    """The sensor whose rest surface is higher over its rim by a share, else as of `at_other_height`."""
+    """Raise the rest surface of a sensor by a share of its height over the rim; otherwise like `at_other_height`."""
     surface = sensor.surface
     if isinstance(surface, InflatedSurface):
         surface = surface.of_height((1 + share) * surface.formed.height)
@@ -84,21 +84,21 @@ def changed_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple
     rays = sensor.camera.pixel_to_ray(sensor.camera.point_to_pixel(torch.from_numpy(positions)))
     origins, directions = rays.origin.numpy(), rays.direction.numpy()
     before, after = (surface.ray_points(origins, directions).distance for surface in (sensor.membrane, membrane))
-    moved = after - before  # of facets on the same grid: a marker that is off its facet stays so
+    moved = after - before  # between facets of the same grid: a marker keeps its distance from the facet
     kept = np.isfinite(moved)
     markers = Markers("dots", positions=(positions + moved[:, None] * directions)[kept])
     return replace(sensor, surface=surface, membrane=membrane, markers=markers), kept
 
 
 class HeightEffect(NamedTuple):
-    """What presses tell otherwise where the rest surface has another height, by one standard deviation of it.
+    """Effect of one standard deviation of the rest surface's height on inferences from presses.
 
     Attributes:
-        shift: shift of the logarithm of the prestretch that they tell.
-        by_stretch: change of the forces' logarithm with one standard deviation of the prestretch, in the mean.
-        by_height: with the height.
-        mean: mean of the height, by what was stated of it and what the presses tell, in stated standard deviations.
-        deviation: deviation of the height, in stated ones.
+        shift: change of the inferred logarithm of the prestretch.
+        by_stretch: mean change of the forces' logarithm for one standard deviation of the prestretch.
+        by_height: mean change of the forces' logarithm for one standard deviation of the height.
+        mean: mean of the height given the stated value and the presses, in stated standard deviations.
+        deviation: standard deviation of the height given both, in stated standard deviations.
     """
 
     shift: float
@@ -109,24 +109,24 @@ class HeightEffect(NamedTuple):
 
 
 class PressesTold(NamedTuple):
-    """What presses tell at some prestretches, one standard deviation from the best and there: their loss in sum, `[S]`, and the
-    magnitudes of the forces found, `[S, B]`."""
+    """Results of presses at S prestretches, up to one standard deviation from the best one: the sum of their losses, `[S]`, and
+    the magnitudes of reconstructed forces, `[S, B]`."""
 
     losses: np.ndarray
     forces: np.ndarray
 
 
 def height_effect(own: PressesTold, other: PressesTold, step: float, variance: float) -> HeightEffect:
-    """From what presses tell on both surfaces.
+    """Compute the effect of the height from the presses on two surfaces.
 
-    Near its minimum the loss is a parabola over the prestretch's logarithm, of curvature 1 / variance; a slope `k` that the
-    height adds to it moves the minimum by `-k variance`.
+    Near its minimum, the loss is a parabola over the prestretch's logarithm with curvature 1 / variance. A slope `k` that the
+    height adds to the loss moves the minimum by `-k variance`.
 
     Args:
-        own: on the sensor's surface.
-        other: on that of another height.
+        own: results on the sensor's surface.
+        other: results on the surface of another height.
         step: step of the prestretch's logarithm.
-        variance: variance of the prestretch's logarithm by the presses' losses.
+        variance: variance of the prestretch's logarithm according to the presses' losses.
     """
     added = other.losses - own.losses
     bound = MOST_SHIFT * variance**0.5
@@ -136,12 +136,12 @@ def height_effect(own: PressesTold, other: PressesTold, step: float, variance: f
 
 
 class StatedHeight(NamedTuple):
-    """What is said of the height of a rest surface over its rim.
+    """The prior of the height of a rest surface over its rim.
 
     Attributes:
-        error: standard deviation of what was stated, over the surface's height.
-        mean: what was stated, above the surface's height, in these.
-        reach: how far to either side the height's effect is looked at, in these.
+        error: standard deviation of the stated height, over the surface's height.
+        mean: stated height minus the surface's height, in standard deviations.
+        reach: step of the height to either side with which its effect is computed, in standard deviations.
     """
 
     error: float
@@ -149,7 +149,7 @@ class StatedHeight(NamedTuple):
     reach: float = 1.0
 
     def after(self, height: float, deviation: float) -> "StatedHeight":
-        """The same about the surface that is higher by `height`, which is known to `deviation`, in stated standard deviations.
+        """Return the prior relative to a surface higher by `height`, known to `deviation`; both in stated standard deviations.
 
         Example:
             >>> StatedHeight(0.25).after(1.0, 0.2)
@@ -159,27 +159,28 @@ class StatedHeight(NamedTuple):
         return StatedHeight(error, self.mean - height, float(np.clip(2 * deviation, LEAST_REACH, SHRINKING * self.reach)))
 
     def is_settled(self, height: float, deviation: float) -> bool:
-        """Whether a height found, known to `deviation`, is about the surface's, and was looked for about as closely."""
+        """Return whether the inferred height, known to `deviation`, is close to the surface's and the reach is small enough."""
         return abs(height) <= SETTLED * deviation and self.reach <= max(LEAST_REACH, 4 * deviation)
 
 
 def height_told(
     own: PressesTold, lower: PressesTold, higher: PressesTold, step: float, variance: float, stated: StatedHeight
 ) -> HeightEffect:
-    """What presses tell of the height `h` itself, and otherwise with it, where it can be changed both ways; all at two
-    prestretches, one step below and above the lowest loss.
+    """Infer the height `h` from presses on three surfaces, and its effect on other inferences.
+
+    All results are at two prestretches, one step below and one step above the lowest loss.
 
     Near its minimum over the prestretch's logarithm `z` the loss is a parabola in both,
-    `z^2 / (2 variance) + k z h + g h + c h^2 / 2`; least over `z` it is `g h + (c - k^2 variance) h^2 / 2`. What was stated
-    adds `(h - mean)^2 / 2`.
+    `z^2 / (2 variance) + k z h + g h + c h^2 / 2`; its minimum over `z` is `g h + (c - k^2 variance) h^2 / 2`. The prior adds
+    `(h - mean)^2 / 2`.
 
     Args:
-        own: on the sensor's surface.
-        lower: on one that is lower by `stated.reach` standard deviations.
-        higher: on one that is as much higher.
+        own: results on the sensor's surface.
+        lower: results on a surface lower by `stated.reach` standard deviations.
+        higher: results on a surface higher by as much.
         step: step of the prestretch's logarithm.
-        variance: variance of the prestretch's logarithm by the presses' losses.
-        stated: stated deviation of the height.
+        variance: variance of the prestretch's logarithm according to the presses' losses.
+        stated: prior of the height.
     """
     d = stated.reach
     slope = (higher.losses - lower.losses) / (2 * d)

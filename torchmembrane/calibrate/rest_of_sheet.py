@@ -1,4 +1,4 @@
-"""Pose, height and prestretch of a blown up sheet from one rest image of listed dots, and a gauge at rest."""
+"""Pose, height and prestretch of an inflated sheet from one rest image of listed dots, and a gauge reading at rest."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,16 +19,16 @@ from .rest import NAMES, RestFit, measured_outlines, nulling, shading_bias, warn
 from .surface import fine_surface, frames_at
 
 SHEET_NAMES = [*NAMES, "height", "prestretch"]
-STRETCH_ERROR = 0.1  # standard deviation of the prestretch that the file states: dots alone tell it worse
-HELD_ERROR = 0.02  # of a gauge's reading and the modulus together, relative
-STEP = 0.01  # of height and prestretch, relative, for derivatives
+STRETCH_ERROR = 0.1  # standard deviation of the file's prestretch; dots alone determine it less accurately
+HELD_ERROR = 0.02  # relative standard deviation of gauge reading over modulus
+STEP = 0.01  # relative step of height and prestretch for finite differences
 ROUNDS = 2
-CENTRED = 0.5  # px: noise of dots until it is known
+CENTRED = 0.5  # px, initial guess of the dots' noise
 
 
 class _Linear(NamedTuple):
-    """Where material points of the sheet are, and what holds it, near a height and prestretch `at`: `points [D, 3]` with
-    derivatives `[D, 3, 2]`; logarithm of the pressure, with `[2]`."""
+    """Linearisation of the sheet about a height and prestretch `at`: its material `points [D, 3]` with derivatives
+    `slopes [D, 3, 2]`, and the logarithm of its pressure with derivatives `[2]`."""
 
     at: np.ndarray
     points: np.ndarray
@@ -37,12 +37,12 @@ class _Linear(NamedTuple):
     pressure_slopes: np.ndarray
 
     def moved(self, change: Tensor) -> Tensor:
-        """The points' displacements from `points`, `[D, 3]`."""
+        """Return the displacements of the points for a change of height and prestretch `[2]`, `[D, 3]`."""
         return torch.from_numpy(self.slopes) @ change
 
 
 class _Material:
-    """The listed dots as material points of the sheet: where they are, whatever its height and prestretch."""
+    """The listed dots as material points of the sheet, with their positions at any height and prestretch."""
 
     def __init__(self, sensor: Sensor, surface: InflatedSurface, positions: np.ndarray) -> None:
         fine = fine_surface(sensor)
@@ -55,16 +55,16 @@ class _Material:
         return points
 
     def sheet_with(self, height: float, prestretch: float) -> InflatedSurface:
-        """The sheet at a height, with a prestretch."""
+        """Return the sheet with this height and prestretch."""
         material = replace(self.surface.material, prestretch=max(1.0, prestretch))
         return replace(self.surface.of_height(height), material=material)
 
     def positions(self, sheet: InflatedSurface) -> np.ndarray:
-        """Of the dots, `[D, 3]`."""
+        """Return the positions of the dots on a sheet, `[D, 3]`."""
         return self._on(sheet.formed.resampled_to(self.grid)[0].reshape(-1, 3)) + self.off
 
     def linear(self, at: np.ndarray) -> _Linear:
-        """Near a height and prestretch."""
+        """Linearise the sheet about a height and prestretch."""
         here, *others = (self.sheet_with(*(at * factor)) for factor in ((1.0, 1.0), (1 + STEP, 1.0), (1.0, 1 + STEP)))
         points, p = self.positions(here), float(np.log(here.formed.pressure))
         slopes = [(self.positions(other) - points) / (STEP * value) for other, value in zip(others, at, strict=True)]
@@ -73,25 +73,25 @@ class _Material:
 
 
 def rest_of_sheet(sensor: Sensor, image: np.ndarray, overpressure: float | None, progress: Progress) -> RestFit:
-    """As `rest_from_image`, of an inflated surface: height and prestretch are found with its pose.
+    """Fit pose, height and prestretch of an inflated surface to a rest image; `rest_from_image` calls this function.
 
-    The dots are material points; the prestretch stays within `STRETCH_ERROR` of the file's but for what dots and gauge say. The
-    gauge at rest counts where the modulus is known; else the modulus follows from it.
+    The dots are material points of the sheet. The file's prestretch is a prior with standard deviation `STRETCH_ERROR`. The
+    gauge reading at rest is a further datum if the modulus is known; otherwise the modulus follows from it.
 
     Args:
-        sensor: the design, its surface an `InflatedSurface`, with a list of dots.
-        image: `[H, W]` the membrane at rest, grey in 0..1.
-        overpressure: at rest, hPa.
-        progress: is told how far it is.
+        sensor: the design, whose surface is an `InflatedSurface`, with a list of dots.
+        image: grey image of the membrane at rest, `[H, W]`, in 0..1.
+        overpressure: gauge reading at rest, hPa.
+        progress: called with the completed share.
 
     Returns:
-        The sensor found, its rim as points in the camera's frame, and the fit: pose, height, prestretch.
+        The `RestFit` of pose, height and prestretch; the rim of its sensor is given as points in the camera's frame.
 
     Raises:
-        MembraneError: as for `rest_from_image`; a height or prestretch without an equilibrium.
+        MembraneError: as for `rest_from_image`; or no equilibrium exists at a height and prestretch.
     """
     sheet, X, sizes = sensor.surface, sensor.markers.positions, sensor.markers.sizes
-    assert isinstance(sheet, InflatedSurface) and X is not None  # as `rest_from_image` has seen
+    assert isinstance(sheet, InflatedSurface) and X is not None  # checked by `rest_from_image`
     image = check_image("calibrate rest: the image", image, sensor.camera.image_size)
     progress(0.0, "dots of the image")
     fine = fine_surface(sensor)
@@ -120,27 +120,27 @@ def rest_of_sheet(sensor: Sensor, image: np.ndarray, overpressure: float | None,
 
 
 class _Seen:
-    """Dots as a camera sees them, by the eight numbers."""
+    """Projection of the dots into the image as a function of the eight parameters."""
 
     def __init__(self, sensor: Sensor, outlines: Tensor, pixels: np.ndarray, pivot: Tensor, linear: _Linear) -> None:
         self.sensor, self.outlines, self.pixels, self.pivot, self.linear = sensor, outlines, pixels, pivot, linear
 
     def placed(self, theta: Tensor) -> Tensor:
-        """The dots' outlines in the camera's frame, `[D, 8, 3]`."""
+        """Return the dots' outlines in the camera's frame, `[D, 8, 3]`."""
         moved = self.outlines + self.linear.moved(theta[6:] - torch.from_numpy(self.linear.at))[:, None]
         return (moved - self.pivot) @ rotations(theta[:3]).mT + self.pivot + theta[3:6]
 
     def modelled(self, theta: Tensor, used: np.ndarray) -> Tensor:
-        """Centres in the image, `[used, 2]`."""
+        """Return the modelled pixels of the used dots, `[used, 2]`."""
         return outline_centres(self.sensor.camera.point_to_pixel(self.placed(theta)[torch.from_numpy(used)]))
 
     def jacobian(self, theta: np.ndarray, used: np.ndarray) -> np.ndarray:
-        """Of `modelled`, `[2 used, 8]`."""
+        """Return the Jacobian of `modelled`, `[2 used, 8]`."""
         found: np.ndarray = jacfwd(self.modelled)(torch.from_numpy(theta), used).flatten(0, 1).numpy()
         return found
 
     def fit(self, start: np.ndarray, used: np.ndarray, known: tuple[np.ndarray, np.ndarray], noise: float) -> Fit:
-        """The eight numbers; `known`: values and rows of what is known besides, in standard deviations."""
+        """Fit the eight parameters; `known` are the values and rows of further linear data, in standard deviations."""
 
         def residuals(theta: np.ndarray) -> np.ndarray:
             seen = self.modelled(torch.from_numpy(theta), used).numpy() - self.pixels[used]
@@ -152,7 +152,7 @@ class _Seen:
 
 
 def _known(sensor: Sensor, linear: _Linear, stated: np.ndarray, overpressure: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """What is known of height and prestretch besides the image, in standard deviations: values and rows of `theta [8]`."""
+    """Return values and rows for `theta [8]` of the data on prestretch and pressure, in standard deviations."""
     rows, values = [np.eye(8)[7] / STRETCH_ERROR], [stated[1] / STRETCH_ERROR]
     surface = sensor.surface
     if overpressure is not None and sensor.force_unit == "N" and isinstance(surface, InflatedSurface):
@@ -173,7 +173,7 @@ def _moved(
     image: np.ndarray,
     overpressure: float | None,
 ) -> RestFit:
-    """The sensor where and as it was found, its dots moved along the surface to where they are seen."""
+    """Return the fit with the fitted sensor, whose dots are moved along the surface to their measured pixels."""
     theta = torch.from_numpy(result.values)
     rotation, pivot, offset = rotations(theta[:3]).numpy(), seen.pivot.numpy(), result.values[3:6]
     flat = dots.sheet_with(*result.values[6:])

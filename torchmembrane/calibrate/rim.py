@@ -1,4 +1,4 @@
-"""The outline of the rim in a rest image, without anything known before: the ellipse along which the grey steps most."""
+"""Detection of the rim in a rest image without prior knowledge: the ellipse with the strongest edges along it."""
 
 from typing import NamedTuple
 
@@ -9,31 +9,31 @@ from ..errors import MembraneError
 from ..files.levels import too_few_bits
 
 RAYS = 180
-SMOOTH = 1.5  # px, of the image before its edges are taken
-FAINT = 0.01  # grey per px: fainter steps are no edges
-FAINTER = 0.1  # nor are those so much fainter than the strongest
-STRONGEST = 3  # edges of each ray that are tried
+SMOOTH = 1.5  # px, standard deviation of the Gaussian filter before edge detection
+FAINT = 0.01  # smallest gradient of an edge, grey per px
+FAINTER = 0.1  # smallest gradient of an edge, over the median of the rays' strongest
+STRONGEST = 3  # edges of each ray from which trials are drawn
 TRIALS = 4000
-WIDE = 3.0  # px, by which an edge may be off the first ellipse
-CLOSE = 1.5  # px, off the last
-INSIDE = 0.95  # of the markers, at least, lie within the rim
-SMALLEST = 0.15  # half axis, of the image's shorter side
-FLATTEST = 0.5  # half axes' ratio
-OFF_CENTRE = 0.25  # of the image's sides, that the rim's middle is from the image's
-SEEN = 0.6  # of the outline within the image shows an edge, at least
-IN_IMAGE = 0.5  # of the outline lies within the image, at least
-LOCATION_ERROR = 0.3  # px, of an edge as a whole: what light and blur shift (docs/own_sensor.md)
+WIDE = 3.0  # px, largest distance of an edge from the first ellipse
+CLOSE = 1.5  # px, largest distance of an edge from the last ellipse
+INSIDE = 0.95  # smallest share of the markers that lie within the rim
+SMALLEST = 0.15  # shorter half axis, over the image's shorter side
+FLATTEST = 0.5  # smallest ratio of the half axes
+OFF_CENTRE = 0.25  # largest offset of the rim's centre from the image's centre, over the image's sides
+SEEN = 0.6  # smallest share of the outline within the image that shows an edge
+IN_IMAGE = 0.5  # smallest share of the outline that lies within the image
+LOCATION_ERROR = 0.3  # px, shift of the whole edge by light and blur (docs/own_sensor.md)
 ROUNDS = 6
 
 
 class RimOutline(NamedTuple):
-    """The rim as an image shows it.
+    """The ellipse of the rim in an image.
 
     Attributes:
-        centre: `(u, v)` px.
-        half_axes: the longer and the shorter one, px.
+        centre: centre `(u, v)`, px.
+        half_axes: the longer and the shorter half axis, px.
         deviation: standard deviation of centre and half axes, px.
-        share: share of the outline within the image along which an edge is seen.
+        share: share of the outline within the image that shows an edge.
     """
 
     centre: tuple[float, float]
@@ -43,7 +43,7 @@ class RimOutline(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """Steps of grey along rays from a point within: `[RAYS, R]`, one column a pixel; NaN beyond the image."""
+    """Derivatives of grey along rays from an inner point, `[RAYS, R]`, one column per pixel; NaN beyond the image."""
 
     origin: np.ndarray
     directions: np.ndarray
@@ -51,14 +51,14 @@ class _Steps(NamedTuple):
 
 
 def find_rim(image: np.ndarray, inside: np.ndarray | None = None) -> RimOutline:
-    """The ellipse around the membrane along which the grey steps in one sense, from light to dark or from dark to light.
+    """Find the ellipse around the membrane along which the grey changes consistently, from light to dark or dark to light.
 
-    Edges are found on rays from the middle. Ellipses through five of them at random, and circles through three, are judged by
-    how much of their length shows an edge (RANSAC); the best is fitted to its edges by least squares.
+    Edges are found on rays from the centre. Ellipses through five random edges, and circles through three, are ranked by the
+    share of their length that shows an edge (RANSAC); the best is refined by least squares.
 
     Args:
-        image: `[H, W]` grey in 0..1, of the membrane at rest.
-        inside: `[D, 2]` px, markers; their edges are passed over, and the rim encloses them.
+        image: grey image of the membrane at rest, `[H, W]`, in 0..1.
+        inside: pixels of markers, `[D, 2]`; edges among them are ignored, and the rim encloses them.
 
     Returns:
         The outline.
@@ -67,8 +67,8 @@ def find_rim(image: np.ndarray, inside: np.ndarray | None = None) -> RimOutline:
         MembraneError: no outline shows an edge over `SEEN` of its length, with `IN_IMAGE` of it in the image.
 
     Limitations:
-        A ring that holds the membrane has an inner and an outer edge: the one that is seen better is found. Look at it
-        (`torchmembrane check --out`).
+        A ring that holds the membrane has an inner and an outer edge; the one with more contrast is found. Check the result
+        with `torchmembrane check --out`.
 
     Example:
         >>> v, u = np.mgrid[:120, :160]
@@ -105,14 +105,14 @@ def _steps(image: np.ndarray, inside: np.ndarray | None) -> _Steps:
 
 
 def _hull(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """How far markers `[D, 2]` reach along each direction `[N, 2]`, those within a twentieth of a turn."""
+    """Return the distance of the farthest marker `[D, 2]` within a twentieth of a turn of each direction `[N, 2]`, `[N]`."""
     reach, along = np.linalg.norm(points, axis=1), points @ directions.T
     near = along > np.cos(np.pi / 10) * reach[:, None]
     return np.where(near, reach[:, None], 0.0).max(0)
 
 
 def _best(seen: _Steps, sense: int, shape: tuple[int, ...], inside: np.ndarray | None) -> RimOutline | None:
-    """The outline of one sense, +1: lighter outside; None where there are no edges."""
+    """Return the best outline with edges of one sign (+1: lighter outside); None if there are too few edges."""
     steps = np.nan_to_num(sense * seen.steps)
     strong = float(np.quantile(steps.max(1), 0.5))
     peaks = (steps > max(FAINT, FAINTER * strong)) & (steps == maximum_filter1d(steps, 5, axis=1))
@@ -138,7 +138,7 @@ def _best(seen: _Steps, sense: int, shape: tuple[int, ...], inside: np.ndarray |
 
 
 def _trials(steps: np.ndarray, points: np.ndarray, ray: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Conics `[N, 5]` through edges at random, `TRIALS` ellipses and as many circles."""
+    """Return conics `[N, 5]` through random edges, `TRIALS` ellipses and as many circles."""
     strength = steps[ray, radius]
     order = np.lexsort((-strength, ray))
     rank = np.empty(len(ray), int)
@@ -150,7 +150,7 @@ def _trials(steps: np.ndarray, points: np.ndarray, ray: np.ndarray, radius: np.n
 
 
 def _through(points: np.ndarray, terms: slice) -> np.ndarray:
-    """Conics `[N, 5]` through points `[N, k, 2]` about the origin, of the first `terms` of `_monomials`."""
+    """Return conics `[N, 5]` through points `[N, k, 2]` relative to the origin, using the first `terms` of `_monomials`."""
     matrix = _monomials(points)[..., terms]
     solved = np.zeros((len(points), 5))
     regular = abs(np.linalg.det(matrix / abs(matrix).mean((0, 1)))) > 1e-9
@@ -159,20 +159,20 @@ def _through(points: np.ndarray, terms: slice) -> np.ndarray:
 
 
 def _monomials(points: np.ndarray) -> np.ndarray:
-    """Of a conic `a (x^2 + y^2) + b x + c y + d (x^2 - y^2) + e x y = 1`, `[..., 5]`."""
+    """Return the monomials `[..., 5]` of a conic `a (x^2 + y^2) + b x + c y + d (x^2 - y^2) + e x y = 1`."""
     x, y = points[..., 0], points[..., 1]
     return np.stack([x * x + y * y, x, y, x * x - y * y, x * y], -1)
 
 
 def _fitted(points: np.ndarray) -> np.ndarray:
-    """The conic `[5]` near points `[N, 2]`, by least squares."""
+    """Fit a conic `[5]` to points `[N, 2]` by least squares."""
     rows = _monomials(points)
     size = abs(rows).mean(0)
     return np.linalg.lstsq(rows / size, np.ones(len(rows)), rcond=None)[0] / size
 
 
 def _reach(conics: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """How far from the origin each conic `[N, 5]` cuts each direction `[R, 2]`, px."""
+    """Return the distance from the origin at which each conic `[N, 5]` crosses each direction `[R, 2]`, `[N, R]`, px."""
     terms = _monomials(directions)
     square, linear = conics[:, [0, 3, 4]] @ terms[:, [0, 3, 4]].T, conics[:, 1:3] @ directions.T
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -180,7 +180,7 @@ def _reach(conics: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def _ellipses(conics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres `[N, 2]` and half axes `[N, 2]`, the longer one first, px; NaN where a conic is no ellipse."""
+    """Return centres `[N, 2]` and half axes `[N, 2]`, the longer one first, px; NaN if a conic is not an ellipse."""
     a, b, c, d, e = conics.T
     form = np.stack([np.stack([a + d, e / 2], -1), np.stack([e / 2, a - d], -1)], -2)
     proper = a > np.hypot(d, e / 2)
@@ -194,7 +194,7 @@ def _ellipses(conics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_possible(conics: np.ndarray, seen: _Steps, shape: tuple[int, ...], inside: np.ndarray | None) -> np.ndarray:
-    """Whether a conic `[N]` is an ellipse that may be the rim."""
+    """Return whether each conic is an ellipse that may be the rim, `[N]` bool."""
     centre, axes = _ellipses(conics)
     with np.errstate(invalid="ignore"):
         possible = (axes[:, 1] > SMALLEST * min(shape)) & (axes[:, 1] > FLATTEST * axes[:, 0])
@@ -207,7 +207,7 @@ def _is_possible(conics: np.ndarray, seen: _Steps, shape: tuple[int, ...], insid
 
 
 def _share(conics: np.ndarray, seen: _Steps, edges: np.ndarray) -> np.ndarray:
-    """Mean `[N]` of the edges `[RAYS, R]`, 0 or 1 or between, along the conics within the image."""
+    """Return the mean of `edges [RAYS, R]` (values from 0 to 1) along each conic within the image, `[N]`."""
     radius = np.rint(np.nan_to_num(_reach(conics, seen.directions)).clip(0, seen.steps.shape[1] - 1)).astype(int)
     rays = np.arange(RAYS)
     within = np.isfinite(seen.steps[rays, radius])
@@ -215,7 +215,7 @@ def _share(conics: np.ndarray, seen: _Steps, edges: np.ndarray) -> np.ndarray:
 
 
 def _outline(conic: np.ndarray, seen: _Steps, steps: np.ndarray, peaks: np.ndarray) -> RimOutline:
-    """The outline, fitted to the edges' places between pixels."""
+    """Refine a conic with subpixel positions of the edges, and return it as an outline."""
     for _ in range(2):
         ray, radius = np.nonzero(peaks)
         kept = (

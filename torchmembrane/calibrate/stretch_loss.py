@@ -1,10 +1,10 @@
-"""What a prestretch costs where presses were measured: how badly they are explained with it, their pushes apart.
+"""The loss of measured presses as a function of the prestretch, without the normal-compression term.
 
-The force balance minimises the misfit of the markers and the loss of the tractions, over `p0`. A press with the wrong
-prestretch needs shear and pulls where only pushes can be, and leaves the markers off. Its push is no sign of anything: it is
-what a press is. But its loss, too, changes with the prestretch, up or down with the force, its area and `p0`: it is not
-counted. A solve from rest may also end beside the least loss at one prestretch and not at the next; so the least at each is
-looked for from those at its neighbours, too.
+Force balance minimises the misfit of the markers and a loss of the tractions over `p0`. With a wrong prestretch, a press needs
+shear and tension where only compression is possible, and the markers' misfit grows. Compression is what every press has, so it
+is no evidence; but its loss also changes with the prestretch, up or down depending on the force, its area and `p0`, so it is
+not counted. A solve from rest may miss the minimum at one prestretch and not at the next; therefore the solutions at
+neighbouring prestretches are tried as starts, too.
 """
 
 import torch
@@ -14,14 +14,13 @@ from ..estimators.force_balance.estimator import ForceBalance
 from ..estimators.force_balance.gauss_newton import State
 from ..progress import Progress, silent
 
-STEPS = 4  # from a neighbour's solution
+STEPS = 4  # of Gauss-Newton from a neighbour's solution
 
 Explained = tuple[ForceBalance, Equilibrium]
 
 
 def continued(solutions: list[Explained], observation: Observation, progress: Progress = silent) -> list[Explained]:
-    """The solutions at increasing prestretches, each the better one of itself and what its neighbours' lead to, upwards and
-    then downwards."""
+    """Improve solutions at increasing prestretches by continuation from neighbours, first upwards, then downwards."""
     upwards: list[Explained] = []
     for k, own in enumerate(solutions):
         progress(k / (2 * len(solutions)), "prestretches from their lower neighbours")
@@ -34,7 +33,7 @@ def continued(solutions: list[Explained], observation: Observation, progress: Pr
 
 
 def _better(own: Explained, neighbour: Explained, observation: Observation) -> Explained:
-    """Of each press `own`, or what some steps from the `neighbour`'s solution end at, if that has converged to less."""
+    """Return for each press its `own` solution, or one found from the `neighbour`'s if that converged to a lower objective."""
     (estimator, found), (other, near) = own, neighbour
     measured = estimator.equations.bearings.measured(observation)
     start = State(

@@ -1,4 +1,4 @@
-"""The rest surface as calibration moves it: dots' outlines on it, a new pose, a correction along its normals."""
+"""Operations on the rest surface in calibration: outlines of dots, the recalibrated sensor, a correction along normals."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,12 +19,12 @@ FINE = 65  # vertices per side of the surface that is calibrated
 
 
 class SurfaceProjection(NamedTuple):
-    """Points projected onto a surface.
+    """Projections of N points onto a surface.
 
     Attributes:
-        points: `[N, 3]` the closest points of the surface, length unit.
-        normals: `[N, 3]` its outward unit normals there.
-        signed_distance: `[N]` from there to the points that were projected, along the normals: positive outside.
+        points: the closest points of the surface, `[N, 3]`, length unit.
+        normals: outward unit normals of the surface there, `[N, 3]`.
+        signed_distance: distance of the projected points along the normals, `[N]`, positive outside.
     """
 
     points: np.ndarray
@@ -33,12 +33,12 @@ class SurfaceProjection(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """A surface moved.
+    """A corrected surface.
 
     Attributes:
-        vertices: `[V, 3]` where it is now.
-        offsets: `[V]` by how much it was moved along its outward normals, length unit.
-        deviations: `[V]` standard deviations of the offsets.
+        vertices: corrected vertices, `[V, 3]`.
+        offsets: displacements of the vertices along the outward normals, `[V]`, length unit.
+        deviations: standard deviations of the offsets, `[V]`.
     """
 
     vertices: np.ndarray
@@ -47,7 +47,7 @@ class Correction(NamedTuple):
 
 
 def fine_surface(sensor: Sensor) -> Membrane:
-    """The sensor's rest surface on a grid fine enough to place dots on."""
+    """Return the sensor's rest surface on a grid that is fine enough for placing dots."""
     return sensor.surface.membrane(tuple(max(FINE, side) for side in sensor.membrane.grid))
 
 
@@ -59,7 +59,7 @@ def recalibrated(
     sizes: list[str] | None,
     image: np.ndarray,
 ) -> Sensor:
-    """The sensor with its rest surface at `vertices [V, 3]` (on the grid of `surface`), dots `[D, 3]` and rest image."""
+    """Return the sensor with the rest surface `vertices [V, 3]` (on the grid of `surface`), dots `[D, 3]` and rest image."""
     m, n = surface.grid
     shape = Surface("grid", {"vertices": vertices.reshape(m, n, 3), "fixed": surface.fixed.numpy().reshape(m, n)})
     markers = Markers("dots", sensor.markers.polarity, positions, sizes, image)
@@ -67,13 +67,13 @@ def recalibrated(
 
 
 def frames_at(surface: Membrane, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outward normals `[D, 3]` and two tangents `[D, 3, 2]` of the surface next to `positions [D, 3]`."""
+    """Return outward normals `[D, 3]` and two tangents `[D, 3, 2]` of the surface at the points closest to `positions`."""
     normals = surface_projection(surface, positions).normals
     return normals, tangent_axes(normals).swapaxes(1, 2)
 
 
 def dot_outlines(surface: Membrane, positions: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Points around each dot on the curved surface, `[D, 8, 3]`: circles `radii [D]` in the tangent plane, dropped on it."""
+    """Return outlines of dots on the curved surface, `[D, 8, 3]`: circles of `radii [D]` in the tangent plane, projected."""
     normals, tangents = frames_at(surface, positions)
     angle = 2 * np.pi * np.arange(OUTLINE) / OUTLINE
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -84,7 +84,7 @@ def dot_outlines(surface: Membrane, positions: np.ndarray, radii: np.ndarray) ->
 
 
 def unit_shapes(camera: Camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """How dots of radius 1 are imaged, `[D, 2, 2]` px per length unit, from their `outlines [D, 8, 3]` of `radii [D]`."""
+    """Return the linear maps of unit dots to the image, `[D, 2, 2]`, px per length unit, from `outlines [D, 8, 3]`."""
     p = camera.point_to_pixel(torch.from_numpy(outlines)).numpy()
     quarter = OUTLINE // 4
     columns = [(p[:, k] - p[:, k + OUTLINE // 2]) / (2 * radii[:, None]) for k in (0, quarter)]
@@ -92,20 +92,21 @@ def unit_shapes(camera: Camera, outlines: np.ndarray, radii: np.ndarray) -> np.n
 
 
 def correction(surface: Membrane, projection: SurfaceProjection, variances: np.ndarray) -> Correction:
-    """The smooth displacement that brings the surface onto N points.
+    """Move a surface smoothly onto N points.
 
-    Thin-plate splines (scipy) of the signed distances as vectors, linear where there are no points.
+    The signed distances, as vectors along the normals, are interpolated with thin-plate splines (scipy), which are
+    extrapolated where there are no points.
 
     Args:
         surface: the surface to move.
-        projection: the points, projected onto it.
-        variances: `[N]` of their signed distances.
+        projection: projections of the points onto the surface.
+        variances: variances of their signed distances, `[N]`.
 
     Raises:
-        MembraneError: fewer than 12 points.
+        MembraneError: there are fewer than 12 points.
 
     Limitations:
-        What moves the surface within itself is not observed. Where the rim is far outside the points, it is extrapolated.
+        Tangential displacements are not observed. A rim far outside the points is extrapolated.
     """
     if len(projection.points) < 12:
         raise MembraneError(f"calibrate: {len(projection.points)} points of the rest surface were given; expected at least 12")
@@ -117,7 +118,7 @@ def correction(surface: Membrane, projection: SurfaceProjection, variances: np.n
 
 
 def surface_projection(surface: Membrane, points: np.ndarray) -> SurfaceProjection:
-    """The projection of `points [N, 3]` onto the surface."""
+    """Project `points [N, 3]` onto a surface."""
     near = surface.closest_points(points)
     closest, normals = (
         (values.numpy()[near.vertices] * near.weights[..., None]).sum(1) for values in (surface.rest, surface.rest_normals)

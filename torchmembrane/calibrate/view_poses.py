@@ -1,4 +1,4 @@
-"""Poses of a sensor's further views from rest images of the same dots, the scale from the listed surface."""
+"""Poses of a sensor's further views from rest images of the same dots; the listed surface sets the scale."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,25 +23,25 @@ from .rest import RestFit, rest_from_image
 from .surface import fine_surface
 
 NEAR = 0.35
-"""Of the dots' pitch: a found dot so near to where a listed one is expected may be that one."""
+"""Largest distance between a found dot and the expected position of a listed one for a match, over the dots' pitch."""
 FEWEST_MATCHED = 0.6
-"""Of the dots that a view sees: fewer that are found where they are expected are a coincidence."""
+"""Smallest share of a view's dots that must be found at their expected positions; fewer may be a coincidence."""
 ROUNDS = 8
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
-"""Pitches along u and v by which a first guess may be off."""
+"""Shifts of the first guess along u and v that are tried, over the pitch."""
 TURNS = (-16.0, -8.0, 0.0, 8.0, 16.0)
-"""Degrees, likewise."""
+"""Rotations of the first guess in the image that are tried, degrees."""
 KEPT = 6
-"""First guesses of which a pose is found."""
+"""Number of best first guesses from which a pose is fitted."""
 
 
 class RigFit(NamedTuple):
-    """A sensor with several views, its surface, dots and poses where their rest images show them.
+    """A sensor with several views, calibrated from rest images of all views.
 
     Attributes:
-        sensor: with pose and dots found, and the views' poses and rest images.
-        first: the fit of the first view alone: the surface's pose before it, and the dots on it.
-        further: of each further view its fit: what turned and shifted the surface in its frame, from the pose of the file.
+        sensor: the sensor with the fitted surface, dots and poses, and the views' rest images.
+        first: fit of the first view alone: pose of the surface and the dots on it.
+        further: fit of each further view: rotation and shift of the surface in the view's frame, relative to the file's pose.
     """
 
     sensor: Sensor
@@ -52,22 +52,22 @@ class RigFit(NamedTuple):
 def rest_from_view_images(
     sensor: Sensor, images: Sequence[np.ndarray], overpressure: float | None = None, *, progress: Progress = silent
 ) -> RigFit:
-    """Pose of the rest surface and its dots from the first view's rest image, then the poses of the other views.
+    """Find the pose of the rest surface and its dots in the first view's rest image, then the poses of the other views.
 
-    Each of these is the pose from which its camera sees the dots, as they were found, where its own image shows them; that of
-    the file is a first guess, within tens of degrees.
+    The pose of each other view is fitted to the dots found in its own image; the file's pose is a first guess, which may be
+    wrong by tens of degrees.
 
     Args:
         sensor: the design, with several views and a list of dots.
-        images: of each view, `[H, W]` the membrane at rest, grey in 0..1.
-        overpressure: as of `rest_from_image`.
-        progress: is told how far it is.
+        images: grey image of the membrane at rest for each view, `[H, W]`, in 0..1.
+        overpressure: gauge reading at rest, hPa, as for `rest_from_image`.
+        progress: called with the completed share.
 
     Raises:
-        MembraneError: as of `rest_from_image`, which then names the view; dots that are not recognised in an image.
+        MembraneError: as for `rest_from_image`, with the name of the view; or the dots are not recognised in an image.
 
     Limitations:
-        The scale is that of the listed surface, which no image shows: an outline that is 1 % too large makes all distances so.
+        Images do not show the scale; it is that of the listed surface: if the outline is 1 % too large, so are all distances.
 
     Example:
         >>> from torchmembrane import Camera
@@ -96,19 +96,19 @@ def rest_from_view_images(
 
 
 def placed_view(sensor: Sensor, number: int, image: np.ndarray, *, progress: Progress = silent) -> tuple[Sensor, RestFit]:
-    """The sensor with one of its further views where a rest image shows the listed dots.
+    """Fit the pose of one of a sensor's further views to the listed dots in its rest image.
 
     Args:
-        sensor: with several views, its dots where they are.
-        number: of the view, from 1.
-        image: `[H, W]` of this view, grey in 0..1.
-        progress: is told how far it is.
+        sensor: the sensor with several views and known dots.
+        number: number of the view, from 1.
+        image: rest image of this view, grey, `[H, W]`, in 0..1.
+        progress: called with the completed share.
 
     Returns:
-        The sensor, its view with pose and rest image, and the fit.
+        The sensor, with pose and rest image of this view, and the fit.
 
     Raises:
-        MembraneError: the dots are not recognised, with the view's name.
+        MembraneError: the dots are not recognised; the message names the view.
     """
     view = sensor.views[number]
     try:
@@ -131,13 +131,13 @@ def placed_view(sensor: Sensor, number: int, image: np.ndarray, *, progress: Pro
 
 
 def with_found(sensor: Sensor, found: Sensor) -> Sensor:
-    """A sensor of several views with what was found of the first one alone.
+    """Transfer a calibration of the first view alone to a sensor with several views.
 
-    Where the rest surface is another one now, the further views are placed again by their rest images.
+    If the rest surface has changed, the poses of the further views are fitted again to their rest images.
 
     Args:
-        sensor: with several views, or one.
-        found: its first view's, with another material, surface or dots.
+        sensor: the sensor, with one or several views.
+        found: the sensor of its first view, with another material, surface or dots.
     """
     if not sensor.views:
         return found
@@ -150,24 +150,24 @@ def with_found(sensor: Sensor, found: Sensor) -> Sensor:
 
 
 def recognised(sensor: Sensor, pattern: DotPattern) -> tuple[np.ndarray, np.ndarray]:
-    """A first motion of the surface after which a view has its dots where they were found.
+    """Find an initial motion of the surface that brings a view's dots to where they were found.
 
-    The dots as expected are brought over those found, centre on centre and of the same extent, or some pitches and turns beside
-    that; the nearest ones are taken for each other, which gives an affine map, then a pose, and so better expectations. The
-    start after which most are found counts.
+    The expected dots are laid over the found ones, with equal centre and extent, also shifted by some pitches and rotated.
+    Mutual nearest neighbours are matched, which gives an affine map, then a pose, and thus better predictions. The start with
+    most matches is used.
 
     Args:
-        sensor: of the view alone, as `Sensor.in_view` gives it.
-        pattern: dots found in its image.
+        sensor: the sensor of this view alone, from `Sensor.in_view`.
+        pattern: dots found in the view's image.
 
     Returns:
-        Rotation vector (rad) and shift `[6]`, and the pivot `[3]` of the rotation.
+        Rotation vector (rad) and shift `[6]`, and the pivot of the rotation `[3]`.
 
     Raises:
         MembraneError: fewer than `FEWEST_MATCHED` of the dots that the view would see then are found.
 
     Limitations:
-        A regular pattern of one size of dot, of which the image does not show a whole row, may be taken a pitch off.
+        A regular pattern of equal dots that is not completely visible may be matched with an offset of one pitch.
     """
     shown = markers_in_view(sensor)
     if shown.sum() < FEWEST_MARKERS:
@@ -186,7 +186,7 @@ def recognised(sensor: Sensor, pattern: DotPattern) -> tuple[np.ndarray, np.ndar
 
 
 def _overlays(expected: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
-    """Where dots `[D, 2]` may be among those found `[K, 2]`: affine maps of the expected pixels, those that meet most first."""
+    """Return affine maps of the expected pixels `[D, 2]` that match found pixels `[K, 2]`, those with most matches first."""
     middle, pitch, tree = np.median(expected, 0), _pitch(found), cKDTree(found)
     grown = _extent(found) / _extent(expected)
     tries = []
@@ -204,7 +204,7 @@ def _overlays(expected: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
 
 
 def _each_other(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the expected pixels `[D]` have a found one near, of which they are the nearest, and which one."""
+    """Return which expected pixels have a mutual nearest neighbour nearby, `[D]` bool, and the index of each one's nearest."""
     away, nearest = tree.query(expected)
     near = away < NEAR * _pitch(expected)
     back = np.asarray(cKDTree(expected).query(found[nearest])[1])
@@ -214,8 +214,8 @@ def _each_other(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> tuple
 def _settled(
     sensor: Sensor, X: np.ndarray, sizes: np.ndarray, pivot: np.ndarray, pattern: DotPattern, expected: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """How many dots are found where a pose has them, those of the wrong size against it, and the pose; from a first guess of
-    where they are in the image."""
+    """Fit a pose from a first guess of the dots' pixels; return the number of matches of equal size minus that of different
+    size, and the pose."""
     tree, motion, score = cKDTree(pattern.pixels), np.zeros(6), 0.0
     both = len(np.unique(sizes)) == 2 == len(np.unique(pattern.sizes))
     for _ in range(ROUNDS):
@@ -230,7 +230,7 @@ def _settled(
 
 
 def _pose(sensor: Sensor, X: np.ndarray, pivot: np.ndarray, pixels: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """The motion `[6]` that brings points to where they are seen."""
+    """Fit the motion `[6]` that brings points to their pixels."""
     points, centre, seen = torch.from_numpy(X), torch.from_numpy(pivot), torch.from_numpy(pixels)
 
     def residuals(theta: Tensor) -> Tensor:
@@ -252,7 +252,7 @@ def _turned(motion: np.ndarray, points: np.ndarray, pivot: np.ndarray) -> np.nda
 
 
 def _moved(sensor: Sensor, number: int, motion: np.ndarray, pivot: np.ndarray) -> Sensor:
-    """The sensor with a view whose camera sees the surface as after this motion of it, in the view's frame."""
+    """Return the sensor with a new pose of one view, equivalent to this motion of the surface in the view's frame."""
     views, R = list(sensor.views), rotations(torch.from_numpy(motion[:3])).numpy()
     motion_of_surface = ViewPose(R, pivot + motion[3:] - R @ pivot)
     pose = ViewPose.of_matrix(views[number].pose.matrix @ motion_of_surface.inverse.matrix)
@@ -266,10 +266,10 @@ def _seen(sensor: Sensor, points: np.ndarray) -> np.ndarray:
 
 
 def _pitch(pixels: np.ndarray) -> float:
-    """The median distance to the nearest neighbour."""
+    """Return the median distance to the nearest neighbour."""
     return float(np.median(np.asarray(cKDTree(pixels).query(pixels, k=2)[0])[:, 1]))
 
 
 def _extent(pixels: np.ndarray) -> float:
-    """The median distance from the median."""
+    """Return the median distance from the median."""
     return float(np.median(np.linalg.norm(pixels - np.median(pixels, 0), axis=1)))

@@ -1,6 +1,6 @@
-"""Dots that nobody listed: their positions from several views, and the rest surface through them.
+"""Positions of unlisted dots from several views, and the rest surface through them.
 
-The views are those of one camera that moved, or those of a sensor with several.
+The views are those of one camera that was moved, or those of a sensor with several views.
 """
 
 from collections.abc import Sequence
@@ -29,25 +29,25 @@ from .rest import measured_outlines, shading_bias
 from .surface import Correction, correction, fine_surface, recalibrated, surface_projection
 
 TRAVEL_ERROR = 0.01  # mm
-OBSERVED = 0.1  # of the travel, that its standard deviation is at most: beyond, nothing tells the scale
-MOST_MOVED = 0.1  # of the surface's size, rms: a surface that is moved farther is of another scale than the design
-LARGEST_NOISE = 1e-3  # of the image's diagonal: noise of located dots is a tenth of it, and less
+OBSERVED = 0.1  # largest standard deviation of the travel over the travel, so that the scale is determined
+MOST_MOVED = 0.1  # largest rms correction over the surface's size: beyond, the scale differs from the design's
+LARGEST_NOISE = 1e-3  # largest residual, over the image's diagonal; noise of located dots is at most a tenth of it
 NUMBERS = ("turn_x", "turn_y", "turn_z", "place_x", "place_y", "place_z")
-SIDEWAYS = 0.015  # px: a turned view is shaded to one side, and its located dots share a shift (0.024 px at 4 degrees)
+SIDEWAYS = 0.015  # px, common shift of located dots by one-sided shading in a rotated view (0.024 px at 4 degrees)
 
 
 class ViewsFit(NamedTuple):
-    """The sensor with the surface and dots that several views show.
+    """The sensor with surface and dots found in several views.
 
     Attributes:
         sensor: the sensor with the surface and dots found.
-        names: names of the 6 numbers of each camera pose but the first, `turn_x[1]` of an image, `right.turn_x` of a view.
-        first_guess: these numbers as they were told.
-        fit: fit of these numbers (degrees, length unit), and then of the dots (length unit, first camera's frame).
-        dots: `[D, 3]`.
-        deviations: `[D, 3]` standard deviations of the dots.
-        surface: `Correction` of the designed surface.
-        residuals: `[P, D, 2]` px, measured less modelled, NaN where not used.
+        names: names of the 6 numbers of each camera pose but the first: `turn_x[1]` for an image, `right.turn_x` for a view.
+        first_guess: first guess of these numbers.
+        fit: fit of these numbers (degrees, length unit), followed by the dots (length unit, first camera's frame).
+        dots: positions of the dots, `[D, 3]`.
+        deviations: standard deviations of the dots' coordinates, `[D, 3]`.
+        surface: the `Correction` of the designed surface.
+        residuals: measured minus modelled pixels, `[P, D, 2]`; NaN where not used.
     """
 
     sensor: Sensor
@@ -61,10 +61,10 @@ class ViewsFit(NamedTuple):
 
 
 def placed_dots(sensor: Sensor, image: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """The dots found in a rest image, where their rays meet the designed surface: `[D, 3]` and sizes.
+    """Find dots in a rest image and place them where their rays meet the designed surface; return positions `[D, 3]` and sizes.
 
     Raises:
-        MembraneError: fewer than 12.
+        MembraneError: fewer than 12 dots are found.
     """
     positions, sizes = _dots_on_surface(sensor, image)
     if len(positions) < 12:
@@ -91,33 +91,34 @@ def rest_from_views(
     *,
     progress: Progress = silent,
 ) -> ViewsFit:
-    """Dots and rest surface from P views; the first view is the sensor's own, or its first one.
+    """Find dots and rest surface in P views; the first view's frame is the sensor's.
 
-    Bundle adjustment: all dots, all poses but the first. Then the designed surface is moved along its normals onto the dots.
+    Bundle adjustment fits all dots and all poses but the first. Then the designed surface is moved along its normals onto the
+    dots.
 
     Args:
         sensor: the design.
-        images: P views `[H, W]` of the membrane at rest, grey in 0..1: by one camera that moved, or one of each view of a
-            sensor with several.
-        motions: `[P, 6]` where one camera was, roughly: its position (length unit) and rotation (rotation vector, degrees) in
-            the first image's frame, the first row zeros. None of a sensor with several views, whose poses are the first guess.
-            Dots must be predicted to half their pitch.
-        travel_error: standard deviation of the distance from the first view to the second one, length unit; default:
-            `TRAVEL_ERROR`, 0.01 mm. Images do not show the scale; this length sets it.
-        progress: is told how far it is.
+        images: P grey images of the membrane at rest, `[H, W]`, in 0..1: from one camera that was moved, or one from each view
+            of a sensor with several views.
+        motions: approximate poses of the moved camera, `[P, 6]`: position (length unit) and rotation vector (degrees) in the
+            first image's frame; the first row is zero. They must predict dots to half their pitch. None for a sensor with
+            several views, whose poses are the first guess.
+        travel_error: standard deviation of the distance between the first and the second view, length unit; default:
+            `TRAVEL_ERROR`, 0.01 mm. Images do not show the scale; this distance sets it.
+        progress: called with the completed share.
 
     Returns:
-        The sensor with surface and dots found, of several views with their poses, and the fit.
+        The `ViewsFit`; the poses of a sensor with several views are fitted as well.
 
     Raises:
-        MembraneError: fewer than two views, motions of another shape, no travel or one that is known too badly to set the
-            scale, too few dots, images that no motions near these explain, or a surface so far from the design that its scale
-            is wrong.
+        MembraneError: there are fewer than two views; motions have the wrong shape; there is no travel, or it is too inaccurate
+            to set the scale; too few dots are found; no motions near these fit the images; or the surface is so far from the
+            design that its scale must be wrong.
 
     Limitations:
-        What moves the surface within itself, and its rim outside the dots, is not observed. At least two views must differ.
-        Of one camera that moved, a dot that a single image shows is left out; of a sensor with several views, it is placed on
-        the surface that the others show.
+        Tangential displacements of the surface, and the rim outside the dots, are not observed. At least two views must differ.
+        With one moved camera, a dot seen in a single image is ignored; with several views, it is placed on the surface found
+        from the others.
     """
     sensor.refuse_heights("calibrate views")
     stations = _stations(sensor, images, motions)
@@ -182,13 +183,13 @@ def _refuse_other_scale(change: Correction, size: float, unit: str) -> None:
 
 
 class _Station(NamedTuple):
-    """From where an image was taken.
+    """The camera and approximate pose of one image.
 
     Attributes:
-        sensor: camera and dots, of a sensor with several views those of the view.
-        rotation: rotation vector `[3]` (rad) of its frame in the first one's; of a mirror the rotation after `flip`.
-        position: `[3]` of its centre of projection there.
-        flip: `[3]`, which a mirror does first: a reflection of x.
+        sensor: the sensor with the image's camera and dots; with several views, the sensor of that view.
+        rotation: rotation vector of the image's frame in the first frame, `[3]`, rad; for a mirror, the rotation after `flip`.
+        position: position of the centre of projection in the first frame, `[3]`.
+        flip: factors of x, y and z, `[3]`, applied first: a mirror reflects x.
     """
 
     sensor: Sensor
@@ -197,25 +198,25 @@ class _Station(NamedTuple):
     flip: np.ndarray
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """Points `[..., 3]` of the first frame in this one."""
+        """Transform points `[..., 3]` from the first frame to this one."""
         seen: np.ndarray = (points - self.position) @ rotations(torch.from_numpy(self.rotation)).numpy() * self.flip
         return seen
 
     def project(self, points: Tensor) -> Tensor:
-        """Pixels of points `[..., 3]` of this frame before `flip`."""
+        """Return the pixels of points `[..., 3]` given in this frame before `flip`."""
         pixels: Tensor = self.sensor.camera.point_to_pixel(points * torch.from_numpy(self.flip))
         return pixels
 
     def pose(self, motion: np.ndarray) -> ViewPose:
-        """The view's pose after a motion `[6]`, as of `Bundle`."""
+        """Return the view's pose for a motion `[6]` as in `Bundle`."""
         return ViewPose(rotations(torch.from_numpy(motion[:3])).numpy() * self.flip, motion[3:])
 
 
 def _stations(sensor: Sensor, images: Sequence[np.ndarray], motions: np.ndarray | None) -> list[_Station]:
-    """From where each image was taken, as told.
+    """Return camera and approximate pose of each image.
 
     Raises:
-        MembraneError: too few images or another number of them, no motions of one camera, or motions of several views.
+        MembraneError: the number of images is wrong, or motions are missing (one camera) or given (several views).
     """
     count = len(images)
     if sensor.views:
@@ -241,7 +242,7 @@ def _station_of_view(sensor: Sensor, number: int) -> _Station:
 
 
 def _placed(sensor: Sensor, poses: Sequence[ViewPose], images: Sequence[np.ndarray]) -> Sensor:
-    """The sensor with these poses of its further views, and all views' rest images."""
+    """Return the sensor with these poses and rest images of its further views."""
     first, *others = sensor.views
     placed = [
         replace(view, pose=pose, rest_image=image.astype(np.float32))
@@ -251,14 +252,14 @@ def _placed(sensor: Sensor, poses: Sequence[ViewPose], images: Sequence[np.ndarr
 
 
 def with_dots_of_each_view(sensor: Sensor, images: Sequence[np.ndarray]) -> Sensor:
-    """The sensor with the dots that one view alone shows, too, where their rays meet the rest surface.
+    """Add the dots that only one view shows, placed where their rays meet the rest surface.
 
     Args:
-        sensor: with several views, its poses, surface and other dots as they are.
-        images: of each view, `[H, W]` at rest, grey in 0..1.
+        sensor: the sensor with several views, whose poses, surface and other dots are known.
+        images: rest image of each view, grey, `[H, W]`, in 0..1.
 
     Limitations:
-        A dot that is found at less than half the pitch from a known one is taken for that one.
+        A dot found within half the pitch of a known one is taken for the known one.
     """
     positions = np.asarray(sensor.markers.positions)
     sizes = list(sensor.markers.sizes or ["small"] * len(positions))
@@ -276,7 +277,7 @@ def with_dots_of_each_view(sensor: Sensor, images: Sequence[np.ndarray]) -> Sens
 def _measured(
     sensor: Sensor, stations: Sequence[_Station], images: Sequence[np.ndarray], progress: Progress
 ) -> tuple[Bundle, list[str]]:
-    """The dots as first placed and as measured in every view, and their sizes."""
+    """Return the bundle of initially placed dots and their measured pixels in every view, and the dots' sizes."""
     progress(0.0, "dots of the first view")
     surface = fine_surface(sensor)
     dots, sizes = placed_dots(stations[0].sensor, images[0])
@@ -294,7 +295,7 @@ def _measured(
 
 
 def _shared_errors(cameras: Sequence[Camera], pixels: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Errors that the used dots of each view share, `[residuals, 3 P]` px: outwards, and to either side."""
+    """Return the errors that the used dots of each view share, `[residuals, 3 P]`, px: outward, along u, and along v."""
     sideways = np.broadcast_to(SIDEWAYS * np.eye(2)[:, None], (2, used.sum(), 2))
     outwards = [shading_bias(camera, of_view[row]) for camera, of_view, row in zip(cameras, pixels, used, strict=True)]
     biases = np.concatenate([np.concatenate(outwards)[None], sideways])

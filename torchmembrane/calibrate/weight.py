@@ -1,4 +1,4 @@
-"""Newtons from one known weight: the modulus with which the reconstruction says the force that is known."""
+"""Force scale from one known weight: the modulus with which the reconstructed force equals the known force."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -18,20 +18,20 @@ from .gauge import CONTRADICTION, UNSURE
 from .material import MaterialFit, material_from_images
 from .presses import GAS_ROUNDS
 
-SURE = 0.05  # relative standard deviation of the scale, at most: two of them are a tenth
-AT_THE_RIM = 0.1  # share of the force in patches that reach the rim, from which on it is refused
+SURE = 0.05  # largest relative standard deviation of the scale; twice this is a tenth
+AT_THE_RIM = 0.1  # largest share of the force in contacts that reach the rim
 
-MATERIAL_SHARE = 0.8  # of the time, measured: of `material_from_images`
+MATERIAL_SHARE = 0.8  # share of the time that `material_from_images` takes, measured
 
 
 class WeightFit(NamedTuple):
-    """The sensor that says the weight's force.
+    """The sensor whose reconstructed force equals the weight.
 
     Attributes:
-        sensor: with prestretch and modulus found.
-        material: what `material_from_images` found, before the last scaling.
-        forces: `[B]` magnitudes that the reconstruction then says, N.
-        deviation: deviation of the scale of all forces, relative.
+        sensor: the sensor with prestretch and modulus.
+        material: result of `material_from_images`, before the final scaling.
+        forces: magnitudes of the forces reconstructed with this sensor, `[B]`, N.
+        deviation: relative standard deviation of the scale of forces.
     """
 
     sensor: Sensor
@@ -42,28 +42,28 @@ class WeightFit(NamedTuple):
 
 @check_arguments
 def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progress: Progress = silent) -> WeightFit:
-    """Prestretch and modulus from images of presses by one known force.
+    """Infer prestretch and modulus from images of presses by one known force.
 
-    Prestretch and a first modulus are `material_from_images`'; the modulus is then scaled until the sensor's own
-    reconstruction, on its own grid, says the weight in the mean. Forces are proportional to it, so that the sensor's other
-    forces are then right where their kind of press is, also if prestretch and modulus are both wrong.
+    `material_from_images` gives the prestretch and an initial modulus. The modulus is then scaled until the mean force that the
+    sensor reconstructs on its own grid equals the weight. Forces are proportional to the modulus, so other forces of similar
+    presses are then accurate even if prestretch and modulus are both wrong.
 
     Args:
-        sensor: the sensor, calibrated but for its material.
-        images: `[B, 1, H, W]` grey in 0..1, each under the weight alone.
-        weight: the force's magnitude, N.
-        progress: is told how far it is.
+        sensor: the sensor, calibrated except for its material.
+        images: grey images, `[B, 1, H, W]`, in 0..1; in each, only the weight touches the membrane.
+        weight: magnitude of the force, N.
+        progress: called with the completed share.
 
     Returns:
-        The sensor, and how surely its forces are scaled.
+        The `WeightFit`, with the uncertainty of the force scale.
 
     Raises:
-        MembraneError: a press reaches the rim, which bears a part of the weight; a force that the markers hardly tell, or a
-            scale known worse than `SURE`; images that contradict one another; as of `material_from_images`.
+        MembraneError: a press reaches the rim, which bears a part of the weight; a force hardly shows in the markers; the scale
+            is less accurate than `SURE`; images contradict one another; or as for `material_from_images`.
 
     Limitations:
-        The scale is that of presses such as these: pushed by the same weight elsewhere, or ten times as hard, the grid's and
-        the material's errors are others (docs/recipes.md).
+        The scale is valid for similar presses: with the same weight at another place, or ten times the force, the errors of
+        grid and material differ (docs/recipes.md).
     """
     expect(0 < weight < np.inf, "calibrate material: weight", weight, "a positive force, N")
     images = to_grayscale_batch(images, sensor.camera.image_size, "rgb", torch.zeros((), dtype=torch.float64))
@@ -102,14 +102,15 @@ def _mean(forces: np.ndarray, deviations: np.ndarray) -> float:
 
 def _stiffer(sensor: Sensor, ratio: float) -> Sensor:
     modulus = sensor.material.shear_modulus
-    assert modulus is not None  # as `material_from_images` has found it
+    assert modulus is not None  # `material_from_images` has set it
     return replace(sensor, material=replace(sensor.material, shear_modulus=ratio * modulus))
 
 
 def _told(sensor: Sensor, images: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Magnitudes of the forces in the images, `[B]`, and their relative deviations; refused where they tell no scale."""
+    """Return magnitudes of reconstructed forces, `[B]`, and their relative standard deviations; raise an error if a press is
+    unsuitable."""
     with torch.no_grad():
-        found_now = replace(sensor, record=sensor.record._replace(uncertainty=None))  # of the scale, which is looked for
+        found_now = replace(sensor, record=sensor.record._replace(uncertainty=None))  # the scale is what is sought
         result: Reconstruction = Reconstructor(found_now)(images)
     forces = result.force.norm(dim=1).double().numpy()
     along = (result.force_deviation * result.force).norm(dim=1).double().numpy() / forces.clip(1e-12)

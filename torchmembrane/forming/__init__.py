@@ -1,1 +1,1 @@
-"""Form finding: the rest shape of a stretched sheet on a closed rim, blown up by the fluid's pressure."""
+"""Form finding: the rest shape of a stretched sheet on a closed rim, inflated by the fluid's pressure."""

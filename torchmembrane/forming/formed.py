@@ -1,4 +1,4 @@
-"""From a rim to the rest surface: the grid within the rim, the film in it without pressure, the film blown up."""
+"""From a rim to the rest surface: the grid within the rim, the uninflated film, and the inflated sheet."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -14,17 +14,17 @@ from .inflate import Sheet, inflated_by, inflated_to
 from .outline import Outline, outline_of
 from .outline_grid import OutlineGrid, outline_grid
 
-LINES = 33  # of the grid on which the rest surface is solved, both ways
-FILM_STEPS, FILM_SETTLED = 60, 1e-10  # of the film's heights, over the rim's length
+LINES = 33  # of the grid on which the rest surface is solved, per side
+FILM_STEPS, FILM_SETTLED = 60, 1e-10  # iterations for the film; tolerance of its heights, over the rim's length
 
 
 class SheetMaterial(NamedTuple):
-    """What decides a sheet's shape: its energy and prestretch, without its stiffness.
+    """The properties of a sheet that determine its shape: energy and prestretch, without its stiffness.
 
     Attributes:
         model: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: prestretch of the sheet in its rim, before it is blown up.
-        c2_ratio: C2 / C1, Mooney-Rivlin only.
+        prestretch: prestretch of the sheet in its rim, before inflation.
+        c2_ratio: C2 / C1, for "mooney_rivlin" only.
     """
 
     model: str
@@ -33,12 +33,12 @@ class SheetMaterial(NamedTuple):
 
 
 class Film(NamedTuple):
-    """A sheet in a rim without pressure.
+    """A sheet in a rim, before inflation.
 
     Attributes:
         outline: the rim.
-        cells: the grid within it, with its worst cell.
-        vertices: `[m, n, 3]` in the frame of the rim's plane.
+        cells: the grid within the rim, with its worst cell.
+        vertices: vertices of the sheet, `[m, n, 3]`, in the frame of the rim's plane.
     """
 
     outline: Outline
@@ -47,21 +47,21 @@ class Film(NamedTuple):
 
     @property
     def area(self) -> float:
-        """Length unit squared."""
+        """Area of the sheet, length unit squared."""
         a, b, c = self.vertices.reshape(-1, 3)[grid_triangles(self.cells.places.shape)].transpose(1, 0, 2)
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
 
 
 class FormedSurface(NamedTuple):
-    """A rest surface that was found as an equilibrium, in the camera's frame.
+    """A rest surface in equilibrium, in the camera's frame.
 
     Attributes:
-        vertices: `[m, n, 3]`.
-        sheet: `[m, n, 3]`, where they were without pressure.
-        pressure: that holds it, over shear modulus x thickness of the sheet, 1 / length.
-        height: height of the highest vertex above the rim's plane.
+        vertices: vertices of the surface, `[m, n, 3]`.
+        sheet: positions of the vertices before inflation, `[m, n, 3]`.
+        pressure: equilibrium pressure, over shear modulus x thickness of the sheet, 1 / length.
+        height: height of the highest vertex above the rim's plane, length unit.
         outline: the rim.
-        cells: the grid within it, with its worst cell.
+        cells: the grid within the rim, with its worst cell.
     """
 
     vertices: np.ndarray
@@ -72,7 +72,7 @@ class FormedSurface(NamedTuple):
     cells: OutlineGrid
 
     def resampled_to(self, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and sheet `[*grid, 3]` on another grid, bicubic in the grid's lines."""
+        """Return vertices and sheet on another grid, `[*grid, 3]` each, by bicubic interpolation."""
         return _on(self.vertices, grid), _on(self.sheet, grid)
 
 
@@ -83,22 +83,23 @@ def formed_surface(
     pressure: float | None = None,
     lines: int = LINES,
 ) -> FormedSurface:
-    """The rest surface on a rim: of a sheet that is stretched in it and blown up to a height, or by a pressure.
+    """Find the rest surface of a sheet that is stretched in a rim and inflated to a height, or by a pressure.
 
-    Without pressure the sheet is a film of uniform tension, flat in a plane rim. The answer is kept for the next call.
+    Before inflation the sheet is a film of uniform tension, flat if the rim is planar. Results are cached.
 
     Args:
-        rim: `[K, 3]` once around, camera's frame.
+        rim: points once around the rim, `[K, 3]`, camera's frame.
         material: material of the sheet.
-        height: height of the highest point above the rim's plane, along its normal, which points away from the camera.
-        pressure: in place of the height, over shear modulus x thickness of the sheet, 1 / length.
-        lines: number of lines of the grid on which it is solved, both ways: 8, 16 or 32 and one.
+        height: height of the highest point above the rim's plane, along the normal that points away from the camera, length
+            unit.
+        pressure: pressure, given instead of the height, over shear modulus x thickness of the sheet, 1 / length.
+        lines: number of grid lines per side: 9, 17 or 33.
 
     Returns:
         The `FormedSurface`.
 
     Raises:
-        MembraneError: a rim within which there is no grid, a height or pressure without an equilibrium.
+        MembraneError: no grid was found within the rim, or there is no equilibrium at this height or pressure.
 
     Example:
         >>> from torchmembrane.forming.outline import ellipse
@@ -112,14 +113,14 @@ def formed_surface(
 
 
 def film(rim: np.ndarray, lines: int = LINES) -> Film:
-    """The film of least area in a rim: where a sheet is without pressure.
+    """Find the film of least area in a rim, which is the shape of a sheet before inflation.
 
     Args:
-        rim: `[K, 3]` once around, camera's frame.
-        lines: number of lines of its grid, both ways.
+        rim: points once around the rim, `[K, 3]`, camera's frame.
+        lines: number of grid lines per side.
 
     Raises:
-        MembraneError: a rim within which there is no grid, or no film.
+        MembraneError: no grid or no film was found within the rim.
     """
     outline = outline_of(rim)
     cells = outline_grid(outline.points, lines)
@@ -133,14 +134,15 @@ def _formed(content: bytes, lines: int, material: SheetMaterial, height: float |
     found = inflated_by(sheet, pressure) if height is None and pressure is not None else inflated_to(sheet, height or 0.0)
     vertices, flat = (outline.camera_frame(x) for x in (found.vertices, sheet.vertices))
     for array in (vertices, flat):
-        array.flags.writeable = False  # others get the same
+        array.flags.writeable = False  # the cached arrays are shared
     return FormedSurface(vertices, flat, found.pressure, found.height, outline, cells)
 
 
 def _film(outline: Outline, cells: OutlineGrid) -> np.ndarray:
-    """The film of least area in a rim, `[m, n, 3]`, as heights over the rim's plane.
+    """Return the film of least area in a rim, `[m, n, 3]`, in the frame of the rim's plane.
 
-    `div (grad w / sqrt(1 + |grad w|^2)) = 0` on linear triangles, the root from the step before.
+    Its heights w solve `div (grad w / sqrt(1 + |grad w|^2)) = 0` on linear triangles, by fixed-point iteration with the root
+    from the previous step.
     """
     x, on_rim = cells.vertices.reshape(-1, 2), ~np.isnan(cells.places.ravel())
     w = np.zeros(len(x))

@@ -1,4 +1,4 @@
-"""The equilibrium of a stretched sheet under a pressure, or blown up to a height: Newton's method, from coarse grids to fine.
+"""The equilibrium of a sheet inflated by a pressure, or to a height, by Newton's method on successively finer grids.
 
 grad U(x) = p grad V(x)  on the free vertices;   p given, or the height of the highest vertex given and p unknown
 """
@@ -18,23 +18,23 @@ from ..surface.resampling import at_equal_steps
 from ..surface.topology import grid_triangles
 from .sheet_energy import SheetEnergy
 
-TOLERANCE = 1e-10  # of the forces left, over modulus x edge length
+TOLERANCE = 1e-10  # of the residual forces, over modulus x edge length
 STEPS, HALVINGS = 60, 10
 LONGEST_STEP = 0.1  # of a vertex, over the sheet's size
-RISE = 0.08  # of the height from one equilibrium to the next, over the sheet's size
-HIGHEST = 1.5  # height that is looked at for a pressure, over the sheet's size
-FLAT = 1e-6  # height over the sheet's size: less is no bulge
-AWAY = 3.0  # of the camera, sizes below the sheet, where volumes are counted from
+RISE = 0.08  # largest increase of height between successive equilibria, over the sheet's size
+HIGHEST = 1.5  # largest height tried for a pressure, over the sheet's size
+FLAT = 1e-6  # smallest height of an inflated sheet, over its size
+AWAY = 3.0  # distance of the sheet from the origin, from which volumes are measured, over the sheet's size
 
 
 class Sheet(NamedTuple):
-    """A sheet before it is blown up, in the frame of its rim's plane.
+    """A sheet before inflation, in the frame of its rim's plane.
 
     Attributes:
-        vertices: `[m, n, 3]`, stretched in its rim; the third component above the plane.
-        model: its elastic energy.
-        prestretch: equal in both directions.
-        c2_ratio: C2 / C1, Mooney-Rivlin only.
+        vertices: vertices of the sheet stretched in its rim, `[m, n, 3]`; the third coordinate is the height above the plane.
+        model: elastic energy, "harmonic" | "neo_hookean" | "mooney_rivlin".
+        prestretch: equibiaxial prestretch.
+        c2_ratio: C2 / C1, for "mooney_rivlin" only.
     """
 
     vertices: np.ndarray
@@ -44,12 +44,12 @@ class Sheet(NamedTuple):
 
 
 class Inflated(NamedTuple):
-    """A sheet that is blown up.
+    """An inflated sheet.
 
     Attributes:
-        vertices: `[m, n, 3]`, in the frame of the rim's plane.
-        pressure: that holds it, over shear modulus x thickness of the sheet in its rim; 1 / length.
-        height: height of the highest vertex above the rim's plane.
+        vertices: vertices in equilibrium, `[m, n, 3]`, in the frame of the rim's plane.
+        pressure: equilibrium pressure, over shear modulus x thickness of the sheet in its rim, 1 / length.
+        height: height of the highest vertex above the rim's plane, length unit.
     """
 
     vertices: np.ndarray
@@ -58,39 +58,39 @@ class Inflated(NamedTuple):
 
 
 def inflated_to(sheet: Sheet, height: float) -> Inflated:
-    """The sheet blown up to a height.
+    """Inflate a sheet to a height.
 
     Args:
-        sheet: with an odd number of lines.
+        sheet: the sheet, with an odd number of lines per side.
         height: height of the highest point above the rim's plane, length unit.
 
     Returns:
-        `Inflated`.
+        The `Inflated` sheet.
 
     Raises:
-        MembraneError: the rim itself is as high, or no equilibrium is found.
+        MembraneError: the rim or the uninflated sheet is already as high, or no equilibrium is found.
     """
     return _Inflation(sheet).to_height(height)
 
 
 def inflated_by(sheet: Sheet, pressure: float) -> Inflated:
-    """The sheet blown up by a pressure.
+    """Inflate a sheet by a pressure.
 
     Args:
-        sheet: with an odd number of lines.
-        pressure: over shear modulus x thickness of the sheet, 1 / length, positive.
+        sheet: the sheet, with an odd number of lines per side.
+        pressure: positive pressure, over shear modulus x thickness of the sheet, 1 / length.
 
     Returns:
-        `Inflated`, the lowest equilibrium at this pressure.
+        The `Inflated` sheet: the lowest equilibrium at this pressure.
 
     Raises:
-        MembraneError: the sheet holds no such pressure.
+        MembraneError: the sheet has no equilibrium at this pressure.
     """
     return _Inflation(sheet).by_pressure(pressure)
 
 
 class _Inflation:
-    """Equilibria of one sheet, on grids of every 4th and every 2nd line before its own."""
+    """Solver for the equilibria of one sheet, on grids of every 4th line, every 2nd line, and all lines."""
 
     def __init__(self, sheet: Sheet) -> None:
         self.sheet, self.top = sheet, float(sheet.vertices[..., 2].max())
@@ -98,7 +98,7 @@ class _Inflation:
         strides = [step for step in (4, 2, 1) if (lines - 1) % step == 0 and (lines - 1) // step >= 8] or [1]
         self.levels = []
         for step in strides:
-            with suppress(*([MembraneError] if step > 1 else [])):  # a coarse grid may fold in a rim that bends much
+            with suppress(*([MembraneError] if step > 1 else [])):  # a coarse grid may fold within a strongly curved rim
                 self.levels.append(_Level(sheet._replace(vertices=sheet.vertices[::step, ::step])))
         self.size = self.levels[0].size
 
@@ -143,7 +143,7 @@ class _Inflation:
 
 
 class _Level:
-    """The equations on one grid."""
+    """The equilibrium equations on one grid."""
 
     def __init__(self, sheet: Sheet) -> None:
         size = float(np.linalg.norm(np.ptp(sheet.vertices, axis=(0, 1))))
@@ -164,30 +164,30 @@ class _Level:
         self.scale = self.size / len(self.sheet) ** 0.5
 
     def bulged(self, rise: float) -> Tensor:
-        """The sheet raised by what a soap film of little pressure has: a start for the first equilibrium."""
+        """Return the sheet raised in the shape of a soap film under small pressure: a start for the first equilibrium."""
         z = self._film()
         x = self.sheet.clone()
         x[self.free, 2] += rise * z / z.max()
         return x
 
     def rise_by(self, pressure: float) -> float:
-        """How high a small pressure raises the sheet, at most `RISE`, or a share of it where there is no tension yet."""
+        """Return a first height at a pressure, by linear membrane theory, at most `RISE` over the size."""
         tension = max(float(self.energy.tension), 1e-3)
         return float(np.clip(0.7 * pressure / tension * float(self._film().max()), 1e-3 * self.size, RISE * self.size))
 
     def _film(self) -> Tensor:
-        """Height of a film of tension 1 under pressure 1."""
+        """Return the heights of a film of tension 1 under pressure 1, at the free vertices."""
         harmonic = SheetEnergy(self.membrane, self.sheet, "harmonic")
         K = self._matrix(harmonic.hessian_blocks(self.sheet))[2::3][:, 2::3]
         return torch.from_numpy(splu(csc_array(K)).solve(self.membrane.volume_gradient(self.sheet)[self.free, 2].numpy()))
 
     def interpolated(self, coarse: "_Level", x: Tensor) -> Tensor:
-        """What a coarser grid found, bicubic in its lines; the rim stays on the sheet."""
+        """Interpolate the displacement from a coarser grid bicubically; the rim stays on the sheet."""
         u = at_equal_steps((x - coarse.sheet).numpy().reshape(*coarse.membrane.grid, 3), self.membrane.grid)
         return self.sheet + torch.from_numpy(u.reshape(-1, 3)) * ~self.membrane.fixed[:, None]
 
     def solved(self, x: Tensor, p: float, height: float | None = None) -> tuple[Tensor, float]:
-        """The equilibrium near a start, at the pressure `p`, or at a height and the pressure near `p` that holds it."""
+        """Solve for the equilibrium near `x` at the pressure `p`, or at a given height with an unknown pressure near `p`."""
         for _ in range(STEPS):
             force = self._force(x, p)
             gap = 0.0 if height is None else height - float(x[:, 2].max() - self.shift[2])
@@ -220,7 +220,7 @@ class _Level:
         return torch.from_numpy((y + rise * g).reshape(-1, 3)), float(rise)
 
     def pressure_of(self, x: Tensor) -> float:
-        """The pressure that holds a surface best, by least squares of the forces left."""
+        """Return the pressure that minimises the sum of squared residual forces of a surface."""
         u, v = (a[self.free] for a in (self.energy.gradient(x), self.membrane.volume_gradient(x)))
         return float((u * v).sum() / (v * v).sum())
 

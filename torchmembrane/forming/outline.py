@@ -1,4 +1,4 @@
-"""Closed rims: rectangles with rounded corners, ellipses, curves of points; and the plane through them."""
+"""Closed rims: rectangles with rounded corners, ellipses and curves through points, and the planes through them."""
 
 from typing import NamedTuple
 
@@ -9,18 +9,18 @@ from ..errors import MembraneError
 from ..surface.checks import FARTHEST
 
 FEWEST_POINTS, MOST_POINTS = 3, 2**14
-SAMPLES = 720  # points of a rim by formula
-LEAST_AREA = 1e-3  # that a rim encloses, over its length squared; a circle encloses 0.08
+SAMPLES = 720  # points of a rectangle's or an ellipse's rim
+LEAST_AREA = 1e-3  # smallest area that a rim encloses, over its length squared; a circle encloses 0.08
 
 
 class Outline(NamedTuple):
-    """A closed rim, in the frame of the plane that goes through it best.
+    """A closed rim, in the frame of its mean plane.
 
     Attributes:
-        points: `[K, 2]`, once around counterclockwise, in the plane, from its origin; length unit.
-        heights: `[K]` above the plane.
-        origin: `[3]`, centre of the enclosed area, camera's frame.
-        axes: `[3, 3]`, the plane's two axes and its normal, which points away from the camera (z > 0), as rows.
+        points: points once around the rim, counterclockwise, in the plane, `[K, 2]`, relative to `origin`, length unit.
+        heights: heights of the points above the plane, `[K]`, length unit.
+        origin: centroid of the enclosed area, `[3]`, camera's frame.
+        axes: the plane's two axes and its normal, which points away from the camera (z > 0), as rows, `[3, 3]`.
     """
 
     points: np.ndarray
@@ -30,12 +30,12 @@ class Outline(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Of the rim's projection onto the plane."""
+        """Length of the rim's projection onto the plane."""
         return float(self.steps.sum())
 
     @property
     def steps(self) -> np.ndarray:
-        """From every point to the next one, in the plane, `[K]`."""
+        """Distances from each point to the next one in the plane, `[K]`."""
         return np.linalg.norm(np.roll(self.points, -1, 0) - self.points, axis=1)
 
     @property
@@ -44,11 +44,11 @@ class Outline(NamedTuple):
         return float(np.abs(self.heights).max()) < 1e-9 * self.length
 
     def camera_frame(self, points: np.ndarray) -> np.ndarray:
-        """Points of the plane's frame, `[..., 3]`, in the camera's."""
+        """Transform points `[..., 3]` from the plane's frame to the camera's."""
         return points @ self.axes + self.origin
 
     def sampled(self, count: int) -> np.ndarray:
-        """`count` points of the rim at equal steps of its length, `[count, 3]`: in the plane, and above it."""
+        """Return `count` points at equal steps of arc length, `[count, 3]`: two coordinates in the plane, and the height."""
         at = np.concatenate([[0.0], np.cumsum(self.steps)])
         closed = np.column_stack([self.points, self.heights])[np.r_[: len(self.points), 0]]
         wanted = np.arange(count) / count * at[-1]
@@ -56,17 +56,17 @@ class Outline(NamedTuple):
 
 
 def rectangle(size: tuple[float, float], corner: float = 0.0) -> np.ndarray:
-    """A rectangle with rounded corners about the origin.
+    """Return a rectangle with rounded corners, centred at the origin.
 
     Args:
-        size: along x and y, length unit.
-        corner: radius, at most half the shorter side.
+        size: lengths along x and y, length unit.
+        corner: radius of the corners, at most half the shorter side.
 
     Returns:
         Points `[K, 2]`, counterclockwise.
 
     Raises:
-        MembraneError: a length that is not positive, or too large a radius.
+        MembraneError: a length is not positive, or the radius is too large.
 
     Example:
         >>> rectangle((50.0, 36.0), 4.0).max(0).tolist()
@@ -88,16 +88,16 @@ def rectangle(size: tuple[float, float], corner: float = 0.0) -> np.ndarray:
 
 
 def ellipse(size: tuple[float, float]) -> np.ndarray:
-    """An ellipse about the origin.
+    """Return an ellipse centred at the origin.
 
     Args:
-        size: its diameters along x and y, length unit.
+        size: diameters along x and y, length unit.
 
     Returns:
         Points `[K, 2]`, counterclockwise.
 
     Raises:
-        MembraneError: a length that is not positive.
+        MembraneError: a length is not positive.
 
     Example:
         >>> ellipse((50.0, 36.0)).max(0).tolist()
@@ -109,18 +109,18 @@ def ellipse(size: tuple[float, float]) -> np.ndarray:
 
 
 def outline_of(points: ArrayLike) -> Outline:
-    """The rim through points, once around; the last may repeat the first.
+    """Make the rim through points; the last point may repeat the first.
 
-    The plane's normal is along the enclosed area vector, `1/2 sum x_k x x_k+1`: the largest projection of the rim.
+    The plane's normal is along the enclosed area vector, `1/2 sum x_k x x_k+1`, so that the projected area is largest.
 
     Args:
-        points: `[K, 3]` in the camera's frame, length unit.
+        points: points once around the rim, `[K, 3]`, camera's frame, length unit.
 
     Returns:
         The `Outline`.
 
     Raises:
-        MembraneError: too few points, a point twice, a rim that crosses itself or encloses hardly any area.
+        MembraneError: there are too few points, two points coincide, or the rim crosses itself or encloses hardly any area.
 
     Example:
         >>> square = outline_of([[0, 0, 5], [2, 0, 5], [2, 2, 5], [0, 2, 5]])
@@ -148,7 +148,7 @@ def outline_of(points: ArrayLike) -> Outline:
         raise MembraneError(
             "outline: the rim encloses hardly any area; expected points once around, in their order along the rim"
         )
-    if area[2] < 0:  # the other way round
+    if area[2] < 0:  # clockwise
         X, centred, area = X[::-1], centred[::-1], -area
     axes = _axes(area / np.linalg.norm(area))
     flat = centred @ axes.T
@@ -161,14 +161,14 @@ def outline_of(points: ArrayLike) -> Outline:
 
 
 def encloses(rim: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which points are within a closed polygon, by the number of its sides to their right.
+    """Return which points are inside a closed polygon, by the number of sides to their right.
 
     Args:
-        rim: `[K, 2]` once around, either way.
-        points: `[D, 2]`.
+        rim: vertices of the polygon, `[K, 2]`, in either orientation.
+        points: the points to test, `[D, 2]`.
 
     Returns:
-        `[D]` bool.
+        Whether each point is inside, `[D]` bool.
 
     Example:
         >>> encloses(np.array([[0.0, 0], [4, 0], [4, 4], [2, 1], [0, 4]]), np.array([[1.0, 1], [2, 3], [5, 1]])).tolist()
@@ -184,7 +184,8 @@ def encloses(rim: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _axes(normal: np.ndarray) -> np.ndarray:
-    """The plane's axes: the first is along x of the camera's frame, as far as it lies in the plane."""
+    """Return the plane's axes as rows; the first one is the projection of the camera's x axis onto the plane (y if x is nearly
+    normal to it)."""
     along = np.eye(3)[0 if abs(normal[0]) < 0.9 else 1]
     first = along - (along @ normal) * normal
     first /= np.linalg.norm(first)
@@ -199,7 +200,7 @@ def _centroid(p: np.ndarray) -> np.ndarray:
 
 
 def _crosses_itself(p: np.ndarray) -> bool:
-    """Whether two sides that are not neighbours meet; each side against all, in blocks."""
+    """Return whether two non-adjacent sides intersect; all pairs are tested, in blocks."""
     q, K = np.roll(p, -1, 0), len(p)
 
     def side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -1,13 +1,13 @@
-"""A structured grid within a closed rim, without folds: corners where the rim turns, cells as alike as they can be.
+"""A structured grid within a closed rim, without folds: corners where the rim turns, cells as uniform as possible.
 
-The vertices of the border slide along the rim and those inside move freely, until a measure of all triangles' distortion is
-least: with `J` the map from a right-angled triangle, of the sides' mean lengths, to one of the grid's,
+Border vertices slide along the rim and inner vertices move freely to minimise the distortion of all triangles. With `J` the
+map from a right-angled triangle with the mean side lengths to a triangle of the grid, the measure is
 
     sum [ |J|^2 / (2 det J)  +  SIZE (det J / mean + mean / det J) / 2 ] ^ POWER
 
-the first is 1 where the triangle has that shape, the second where it is as large as the mean. Both have no bound where a
-triangle folds. Triangles whose corners all lie on the rim move with nothing and are left out. A concave rim begins with folds:
-there `det J` is first replaced by a smooth positive function of it, ever closer to it.
+The first term is 1 if the triangle has that shape; the second is smallest if its area equals the mean. Both are unbounded as a
+triangle folds. Triangles whose corners all lie on the rim are left out. Within a concave rim the initial grid may have folds;
+`det J` is then first replaced by smooth positive functions that approach it.
 """
 
 from functools import lru_cache, partial
@@ -24,23 +24,23 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..surface.topology import grid_triangles, rim_loop
 
-PLACES = 40  # on the rim, where the grid's corners may be
-SHIFTS, WINDOW = 4, 1.5  # of the candidates; how far around them the rim is looked at, either way, in their spacing
-POWER = 2  # of the distortion: the worst count more than in a mean
+PLACES = 40  # number of candidates for the grid's corners along the rim
+SHIFTS, WINDOW = 4, 1.5  # iterations that move the candidates; half width of the window around each, over their spacing
+POWER = 2  # of the distortion, so that the worst triangles have more weight
 SIZE = 0.3
 STEPS = (60, 60, 400)
-"""Steps of the descent: two rounds while folds are removed, and the last one."""
-BLUNT = (0.5, 0.05)  # det J up to which it is smoothed, over the mean, where there are folds
+"""Steps of the minimisation: two rounds that remove folds, and the final round."""
+BLUNT = (0.5, 0.05)  # width of the smoothing of det J over its mean, in the rounds that remove folds
 
 
 class OutlineGrid(NamedTuple):
     """A grid within a rim.
 
     Attributes:
-        places: `[m, n]` of border vertices along the rim, 0 to 1 from its first point; NaN inside.
-        vertices: `[m, n, 2]` in the rim's plane.
-        angle: the smallest angle of all triangles that are not wholly on the rim, degrees; 45 is the best.
-        worst: `[2]` the middle of that triangle.
+        places: positions of border vertices along the rim, 0 to 1 from its first point, `[m, n]`; NaN inside.
+        vertices: vertices in the rim's plane, `[m, n, 2]`.
+        angle: smallest angle of all triangles that are not wholly on the rim, degrees; 45 is optimal.
+        worst: centroid of the triangle with that angle, `[2]`.
     """
 
     places: np.ndarray
@@ -50,17 +50,17 @@ class OutlineGrid(NamedTuple):
 
 
 def outline_grid(points: np.ndarray, lines: int) -> OutlineGrid:
-    """A grid of `lines` x `lines` vertices within a rim.
+    """Return a grid of `lines` x `lines` vertices within a rim.
 
     Args:
-        points: `[K, 2]` of the rim, counterclockwise.
-        lines: numbers of vertices both ways, odd.
+        points: points of the rim, `[K, 2]`, counterclockwise.
+        lines: number of vertices per side, odd.
 
     Returns:
         The `OutlineGrid`.
 
     Raises:
-        MembraneError: none without folds was found.
+        MembraneError: no grid without folds was found.
 
     Example:
         >>> from torchmembrane.forming.outline import ellipse
@@ -87,8 +87,10 @@ def _outline_grid(content: bytes, count: int, lines: int) -> OutlineGrid:
 
 
 class _GridProblem:
-    """The measure of distortion and its gradient. Unknowns: logarithms of the border's steps, and the inner vertices over the
-    rim's length."""
+    """The distortion measure and its gradient.
+
+    The unknowns are logarithms of the border's steps, and the inner vertices over the rim's length.
+    """
 
     def __init__(self, points: np.ndarray, lines: int) -> None:
         self.lines, self.border = lines, rim_loop((lines, lines))
@@ -100,16 +102,16 @@ class _GridProblem:
         self.length, self.rim, self.at = at[-1], torch.from_numpy(closed), torch.from_numpy(at / at[-1])
         index = np.arange(lines * lines).reshape(lines, lines)
         a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-        ends = np.stack([(a, b, a, d), (a, b, b, c), (d, c, b, c), (d, c, a, d)], -1).reshape(4, -1)  # of edges along u, and v
+        ends = np.stack([(a, b, a, d), (a, b, b, c), (d, c, b, c), (d, c, a, d)], -1).reshape(4, -1)  # ends of edges along u, v
         free = inside[ends].any(0)
         self.ends = torch.from_numpy(ends[:, free])
         places = _corner_places(points)
         self.corners_at = torch.from_numpy(np.append(places, places[0] + 1))
         sides = self.corners_at.diff().tolist()
-        self.aspect = (sides[0] + sides[2]) / (sides[1] + sides[3])  # of lengths along u over those along v
+        self.aspect = (sides[0] + sides[2]) / (sides[1] + sides[3])  # length along u over length along v
 
     def start(self) -> np.ndarray:
-        """Even steps on every side, and inner vertices at the mean of their neighbours."""
+        """Return equal steps on each side, and inner vertices at the mean of their neighbours."""
         steps = np.zeros(len(self.border))
         x = np.zeros((self.lines**2, 2))
         x[self.border] = self._on_rim(self._along(torch.from_numpy(steps))).numpy()
@@ -129,7 +131,7 @@ class _GridProblem:
         return np.concatenate([steps, (inner / self.length).ravel()])
 
     def _along(self, steps: Tensor) -> Tensor:
-        """Places of the border's vertices, `[4 (lines - 1)]`, from the logarithms of their steps, up to one factor a side."""
+        """Return the positions of border vertices along the rim, `[4 (lines - 1)]`, from logarithms of their relative steps."""
         share = torch.softmax(steps.reshape(4, -1), 1)
         first, length = self.corners_at[:-1, None], self.corners_at.diff()[:, None]
         return (first + length * (torch.cumsum(share, 1) - share)).flatten()
@@ -141,19 +143,19 @@ class _GridProblem:
         return self.rim[k] + share[:, None] * (self.rim[k + 1] - self.rim[k])
 
     def vertices(self, z: Tensor) -> Tensor:
-        """`[V, 2]`."""
+        """Return the vertices of the grid for the unknowns `z`, `[V, 2]`."""
         count = len(self.border)
         x = z.new_zeros(self.lines**2, 2)
         x = x.index_put((torch.from_numpy(self.border),), self._on_rim(self._along(z[:count])))
         return x.index_put((torch.from_numpy(self.inner),), self.length * z[count:].reshape(-1, 2))
 
     def _edges(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Along u and v of every triangle, `[T, 2]` each; along u over the aspect."""
+        """Return the edges along u (divided by the aspect) and v of every triangle, `[T, 2]` each."""
         p, q, r, s = x[self.ends]
         return (q - p) / self.aspect, s - r
 
     def smallest(self, z: np.ndarray) -> float:
-        """The smallest `det J`."""
+        """Return the smallest `det J`."""
         with torch.no_grad():
             return float(_determinant(*self._edges(self.vertices(torch.from_numpy(z)))).min())
 
@@ -200,21 +202,22 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _corner_places(points: np.ndarray) -> np.ndarray:
-    """Places of the grid's four corners along the rim, increasing: where the rim turns by right angles, between straight sides.
+    """Choose the grid's four corners along the rim, increasing: where the rim turns by right angles, between straight sides.
 
-    Candidates are `PLACES` even ones, each moved to the middle of what the rim turns around it; the sum of squares of what the
-    corners' turns lack of a right angle, of what the sides turn, and of the logarithms of opposite sides' ratios is least.
+    Candidates are `PLACES` evenly spaced positions, each moved to the centre of the curvature around it. The chosen corners
+    minimise the sum of squares of three terms: deviations of the corners' turns from a right angle, total turning of each side,
+    and logarithms of the length ratios of opposite sides.
     """
     edges = np.roll(points, -1, 0) - points
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(edges, axis=1))])
     at /= at[-1]
     direction = np.arctan2(edges[:, 1], edges[:, 0])
-    turns = (np.roll(direction, -1) - direction + np.pi) % (2 * np.pi) - np.pi  # at the end of every edge
+    turns = (np.roll(direction, -1) - direction + np.pi) % (2 * np.pi) - np.pi  # at the end of each edge
     bends = np.abs(turns)
 
     def away(places: np.ndarray) -> np.ndarray:
         found: np.ndarray = (at[1:][None] - places[:, None] + 0.5) % 1 - 0.5
-        return found.round(9)  # as all that is compared here: what is equal stays so whatever the unit of length
+        return found.round(9)  # so that ties do not depend on the unit of length
 
     places = (np.arange(PLACES) + 0.5) / PLACES
     for _ in range(SHIFTS):
@@ -231,8 +234,8 @@ def _corner_places(points: np.ndarray) -> np.ndarray:
     lacking = ((turn[sets] - np.pi / 2) ** 2).sum(1)
     between = total[following] - total[sets] - (bent[sets] + bent[np.roll(sets, -1, 1)]) / 2
     uneven = (np.log(sides[:, :2] / sides[:, 2:]) ** 2).sum(1)
-    chosen = sets[int(np.round(lacking + (between**2).sum(1) + uneven, 6).argmin())]  # the first of equal ones
+    chosen = sets[int(np.round(lacking + (between**2).sum(1) + uneven, 6).argmin())]  # the first of equal minima
     corners = places[chosen]
-    if int(turn[chosen].round(6).argmin()) in (1, 3):  # the diagonals split the first and third: the flattest is one of them
+    if int(turn[chosen].round(6).argmin()) in (1, 3):  # the diagonals split corners 0 and 2: the flattest is one of them
         corners = np.concatenate([corners[1:], corners[:1] + 1])
     return corners

@@ -1,4 +1,4 @@
-"""The elastic energy of a membrane that was a sheet before it was blown up: stretched by another amount at every place."""
+"""The elastic energy of an inflated sheet, whose stretch at rest varies from place to place."""
 
 import torch
 from torch import Tensor
@@ -9,19 +9,19 @@ from ..surface.topology import grid_triangles
 
 
 class SheetEnergy(ElasticEnergy):
-    """`ElasticEnergy` whose prestretch and modulus belong to the sheet, not to the rest surface.
+    """`ElasticEnergy` whose prestretch and modulus are those of the sheet before inflation, not of the rest surface.
 
-    With `G` the metric of the sheet's triangles and `g` that of the membrane's, `I = tr(G^-1 g)` and `D = det g / det G` in the
-    same `W(I, D)`, per area of the sheet: tension at rest then varies from place to place and with the direction, as the blown
-    up sheet's does. A membrane that is its own sheet has the energy of `ElasticEnergy`.
+    With the metrics `G` of the sheet's triangles and `g` of the membrane's, `I = tr(G^-1 g)` and `D = det g / det G` are used
+    in the same `W(I, D)`, per area of the sheet. Tension at rest then varies with place and direction, as in the inflated
+    sheet. A membrane that equals its sheet has the energy of `ElasticEnergy`.
 
     Args:
         membrane: the rest surface.
-        sheet: `[V, 3]`, where its vertices were before: stretched in its rim by the prestretch, without pressure.
+        sheet: positions of its vertices before inflation, `[V, 3]`: stretched in the rim by the prestretch, without pressure.
         model: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: prestretch of the sheet, equal in both directions.
-        modulus: shear modulus x thickness of the sheet as it is stretched in its rim, force / length.
-        c2_ratio: C2 / C1, Mooney-Rivlin only.
+        prestretch: equibiaxial prestretch of the sheet.
+        modulus: shear modulus x thickness of the sheet stretched in its rim, force / length.
+        c2_ratio: C2 / C1, for "mooney_rivlin" only.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -54,19 +54,19 @@ class SheetEnergy(ElasticEnergy):
             self.register_buffer(name, value)
 
     def for_membrane(self, membrane: Membrane) -> "SheetEnergy":
-        """The same sheet on every second line of the grid."""
+        """Return the energy of the same sheet on every second grid line."""
         sheet = self.sheet.unflatten(0, self.grid)[::2, ::2].flatten(0, 1)
         return SheetEnergy(membrane, sheet, self.model, float(self.prestretch), self.modulus, self.c2_ratio)
 
     @property
     def rest_stretches(self) -> Tensor:
-        """The principal stretches at rest over the unstretched sheet, larger and smaller, `[T, 2]`, of triangles that are not
-        wholly on the rim."""
+        """Principal stretches at rest relative to the unstretched sheet, larger and smaller, `[T, 2]`, of triangles not wholly
+        on the rim."""
         return (self.prestretch * self.principal_stretches(self.rest))[self.is_free]
 
     @property
     def tension(self) -> Tensor:
-        """The mean tension at rest (force / length), over the rest surface and both principal directions.
+        """Mean tension at rest (force / length), averaged over the rest surface and both principal directions.
 
         Half the trace of the stress resultant is `(I dW/dI + 2 D dW/dD) / sqrt D`.
         """
@@ -78,7 +78,7 @@ class SheetEnergy(ElasticEnergy):
 
 
 class _Reference:
-    """What `ElasticEnergy` takes of a membrane."""
+    """The attributes of a membrane that `ElasticEnergy` uses."""
 
     def __init__(self, rest: Tensor, grid: tuple[int, int]) -> None:
         self.rest, self.grid = rest, grid

@@ -1,1 +1,1 @@
-"""The whole reconstruction as one ONNX model."""
+"""Export of the complete reconstruction as one ONNX model."""

@@ -1,4 +1,4 @@
-"""Comparison of a model with the reconstructor from which it was exported, on images of the sensor at rest and pressed."""
+"""Comparison of an exported model with its reconstructor on simulated images of the sensor at rest and pressed."""
 
 from copy import deepcopy
 from typing import Any, NamedTuple
@@ -13,18 +13,18 @@ from ..reconstruct import Reconstructor
 from ..simulate.dataset import Plan, random_frame
 from ..simulate.simulator import REST_NOISE, Simulator
 
-LARGEST = 3e-5  # distance between the vertices of both, over the surface's size
-ROUNDING = 8.0  # or over that which float32 makes in torch: a batch's length alone may make it several times as much
-NUDGES = tuple(1 - k * 2.0**-24 for k in range(1, 7))  # of images: what float32 just tells from 1; two miss answers that jump
+LARGEST = 3e-5  # largest distance between the vertices of both, over the surface's size
+ROUNDING = 8.0  # or over torch's own rounding error in float32, which the batch size alone may increase several times
+NUDGES = tuple(1 - k * 2.0**-24 for k in range(1, 7))  # factors of images close to 1; fewer may miss discontinuous results
 
 
 class Agreement(NamedTuple):
-    """Results of a model compared with torch.
+    """Comparison of a model's results with torch's.
 
     Attributes:
-        distance: the largest between their vertices, length unit.
-        status: status of the model's frames, the first one twice.
-        expected: torch's.
+        distance: largest distance between their vertices, length unit.
+        status: statuses of the model's frames; the first frame is run twice, in the batch and alone.
+        expected: statuses of torch's frames in the same order.
     """
 
     distance: float
@@ -33,10 +33,10 @@ class Agreement(NamedTuple):
 
 
 def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
-    """Run a model and torch on simulated images of the sensor at rest and pressed.
+    """Run a model and torch on simulated images of the sensor at rest and pressed, and compare the results.
 
     Raises:
-        MembraneError: they disagree by more than the rounding of float32 explains.
+        MembraneError: statuses differ, or vertices differ by more than float32 rounding explains.
     """
     images = check_images(reconstructor)
     found, largest = compare(model, reconstructor, images), LARGEST * reconstructor.estimator.membrane.size
@@ -51,9 +51,12 @@ def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
 
 
 def rounding(reconstructor: Reconstructor, images: Tensor) -> float:
-    """The largest distance of torch's vertices in float32 from those in float64, or from those of images `[B, 1, H, W]` that
-    differ by one rounding. For a nearly unstretched sheet with a contact between markers, which little constrains, it is up to
-    some per cent of the displacement."""
+    """Return the effect of rounding on torch's vertices in float32.
+
+    It is the largest distance from the vertices in float64, and from those of images `[B, 1, H, W]` that differ by a rounding
+    error. For a nearly unstretched sheet with a contact between markers, which is weakly constrained, it is up to some per cent
+    of the displacement.
+    """
     with torch.no_grad():
         found = reconstructor.reconstruct_grey(images).vertices
         others = [reconstructor.reconstruct_grey(nudge * images).vertices for nudge in NUDGES]
@@ -62,13 +65,13 @@ def rounding(reconstructor: Reconstructor, images: Tensor) -> float:
 
 
 def check_images(reconstructor: Reconstructor) -> Tensor:
-    """The sensor at rest, pressed, and at rest, `[3, 1, H, W]`, of views that have images of their own `[3, W, H, W']`; once
-    at rest where its simulator finds no press."""
+    """Simulate images of the sensor at rest, pressed, and at rest, `[3, 1, H, W]`; for W views with images of their own,
+    `[3, W, H, W']`. If the simulator finds no press, return a single image at rest."""
     simulator = Simulator(reconstructor.sensor)
     rest = simulator.images(simulator.membrane.rest, np.random.default_rng(REST_NOISE))
     frames: list[Any] = [rest]
     try:
-        with torch.enable_grad():  # the simulator's, whatever the caller's
+        with torch.enable_grad():  # the simulator needs gradients
             pressed = random_frame(simulator, Plan(kinds=("sphere",)), 0)
         frames += [[pressed.image, *pressed.further], rest]
     except MembraneError:
@@ -77,10 +80,12 @@ def check_images(reconstructor: Reconstructor) -> Tensor:
 
 
 def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agreement:
-    """Run a model, on the batch and on its first frame alone, and torch on `images [B, 1, H, W]`: a tracking one from rest, and
-    again from what torch found."""
+    """Run torch on `images [B, 1, H, W]`, and a model on the batch and on its first frame alone; compare the results.
+
+    A tracking model is run twice, from rest and from the pixels that torch found.
+    """
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # its warnings are of its own optimiser
+    options.log_severity_level = 3  # its warnings concern its own optimiser
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     names = [given.name for given in session.get_inputs()]
     tracks = "previous_pixels" in names

@@ -1,6 +1,7 @@
-"""A sensor's whole reconstruction, image to result, as one ONNX file: `torchmembrane export`.
+"""Export of a sensor's complete reconstruction, from image to result, to one ONNX file (`torchmembrane export`).
 
-The reconstructor is called with `Value`s: what it and its parts mark as `traced` is traced once each and put together.
+The reconstructor is called with `Value`s in place of tensors. Each function marked as `traced` is traced once, and the pieces
+are assembled into one graph.
 """
 
 import json
@@ -32,13 +33,13 @@ from .trace import EXPORTER, traced_model
 
 FORMAT = 1
 SEAL = "SHA-256: "
-CHECK, NODES = 0.65, 11_500  # share of the time before the check, and how many nodes are traced, of the default estimator
+CHECK, NODES = 0.65, 11_500  # for the default estimator: share of the time before the check, and number of traced nodes
 IMAGE, PREVIOUS = "image", "previous_pixels"
-EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
+EXAMPLES = 2  # frames of the example inputs; the batch size of the model stays free
 
 
 class Known(Value):
-    """A value by its name in the graph, with an example to trace with."""
+    """A value of the graph: its name, and an example tensor for tracing."""
 
     def __init__(self, graph: "Tracer", name: str, example: Tensor) -> None:
         super().__init__(graph)
@@ -46,7 +47,7 @@ class Known(Value):
 
 
 class Piece(nn.Module):
-    """A method with the module whose buffers it uses; `arranged` rebuilds its arguments from the tensors among them."""
+    """A function with the module whose buffers it uses; `arranged` rebuilds all its arguments from the tensor arguments."""
 
     def __init__(
         self,
@@ -63,29 +64,29 @@ class Piece(nn.Module):
 
 
 class Tracer:
-    """Appends every call, loop and condition on a `Value` to an `Assembly`.
+    """A recorder that appends every call, loop and conditional on `Value`s to an `Assembly`.
 
-    Nodes are named after the part of the package that they come from.
+    Nodes are named after the subpackage from which they come.
     """
 
     def __init__(self, progress: Progress = silent) -> None:
         self.assembly, self.progress = Assembly(), progress
         self.traced: dict[tuple[Any, ...], onnx.ModelProto] = {}
-        self.nodes = 0  # of the pieces traced so far
+        self.nodes = 0  # number of nodes traced so far
 
     def given(self, name: str, example: Tensor) -> Known:
-        """An input of the graph."""
+        """Return an input of the graph."""
         return Known(self, name, example)
 
     def call(self, owner: nn.Module | None, function: Callable[..., Any], inputs: Sequence[Any]) -> Any:
-        """Values of `function(owner, *inputs)`."""
+        """Append `function(owner, *inputs)` to the graph and return its values."""
         model, names, found = self._trace(owner, function, inputs)
         return self._known(found, self.assembly.append(model, names))
 
     def fori_loop(
         self, step: Callable[..., Any], rows: Sequence[tuple[float, ...]], state: Sequence[Any], given: Sequence[Any]
     ) -> Any:
-        """Values after a loop of a bound piece, as `control_flow.fori_loop`."""
+        """Append a loop over a bound method and return the final values; see `control_flow.fori_loop`."""
         assert isinstance(step, MethodType) and isinstance(step.__self__, nn.Module)
         precise = state[0].example.dtype == torch.float64
         columns = [np.array(column, np.float64 if precise else np.float32) for column in zip(*rows, strict=True)]
@@ -96,7 +97,7 @@ class Tracer:
         return self._known(found, self.assembly.loop(model, names, len(rows), tables))
 
     def cond(self, done: Known, values: Sequence[Known], otherwise: Callable[[], Sequence[Known]]) -> Sequence[Known]:
-        """Values after a conditional, as `control_flow.cond`."""
+        """Append a conditional and return the chosen values; see `control_flow.cond`."""
         condition = self.call(None, _everywhere, (done,))
         names = {k: value.name for k, value in enumerate(values)}
         kinds = [_kind(value.example) for value in values]
@@ -107,7 +108,7 @@ class Tracer:
     def _trace(
         self, owner: nn.Module | None, function: Callable[..., Any], inputs: Sequence[Any]
     ) -> tuple[onnx.ModelProto, dict[str, str], Any]:
-        """The piece as a model, the names that its inputs have here, and examples of its outputs."""
+        """Return the function as a model, the names of its inputs in this graph, and examples of its outputs."""
         leaves, structure = tree_flatten(tuple(inputs))
         places = {k: leaf for k, leaf in enumerate(leaves) if isinstance(leaf, Known)}
         fixed = {k: leaf for k, leaf in enumerate(leaves) if k not in places}
@@ -118,7 +119,7 @@ class Tracer:
             return arguments
 
         names = {f"input {k}": value.name for k, value in places.items()}
-        examples = {f"input {k}": value.example.clone() for k, value in places.items()}  # one tensor twice is traced as one
+        examples = {f"input {k}": value.example.clone() for k, value in places.items()}  # one tensor twice would be one input
         with torch.no_grad():
             found = function(owner, *arranged(*examples.values()))
         if owner is not None:
@@ -129,7 +130,7 @@ class Tracer:
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
                 self.traced[key] = self._whole(traced_model(Piece(owner, function, arranged), examples, outputs))
-            except Exception as error:  # of torch's exporter and of what it calls, which raise what they like
+            except Exception as error:  # torch's exporter and its dependencies raise exceptions of any type
                 reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
                 name = getattr(function, "__qualname__", str(function))
                 raise MembraneError(f"export: {name} cannot be written as ONNX: {reason.strip()}") from error
@@ -137,11 +138,11 @@ class Tracer:
         return self.traced[key], names, found
 
     def _whole(self, model: onnx.ModelProto) -> onnx.ModelProto:
-        """The model with the nodes of its `onnx_function`s inlined."""
+        """Return the model with its `onnx_function` nodes inlined."""
         return inlined(model, self._function)
 
     def _function(self, node: onnx.NodeProto) -> onnx.ModelProto:
-        """The model of an `onnx_function` for the sizes of a node, apart from the batch, and its precision."""
+        """Return the model of an `onnx_function` for a node's sizes (without the batch) and precision."""
         given = {attribute.name: attribute for attribute in node.attribute}
         name, sizes, width = node.op_type, tuple(given["sizes"].ints), given["bytes"].i
         if (name, sizes, width) not in self.traced:
@@ -151,7 +152,7 @@ class Tracer:
         return self.traced[name, sizes, width]
 
     def _known(self, found: Any, names: dict[str, str]) -> Any:
-        """The values of such names, arranged as the examples `found` are."""
+        """Return the values with these names, in the structure of the examples `found`."""
         each = iter(names.values())
         return tree_map(lambda example: None if example is None else Known(self, next(each), example), found)
 
@@ -161,7 +162,7 @@ def _everywhere(_: None, done: Tensor) -> Tensor:
 
 
 def _kind(example: Tensor) -> int:
-    """ONNX' number of a tensor's element type."""
+    """Return the ONNX code of a tensor's element type."""
     return helper.np_dtype_to_tensor_dtype(example.numpy().dtype)
 
 
@@ -173,28 +174,28 @@ def export(
     tracking: bool = False,
     progress: Progress = silent,
 ) -> onnx.ModelProto:
-    """Write the whole reconstruction, image to result, as one ONNX model, if it agrees with torch.
+    """Write the complete reconstruction, from image to result, as one ONNX model, after checking that it agrees with torch.
 
-    Standard operators only, batch free, float32, but for the solve of slack sheets, float64. Run on the sensor at rest and
-    pressed, both simulated, it must give torch's statuses, and vertices within 3e-5 of the surface's size. The model's metadata
-    hold `format`, `version` (this package's), `status_texts` and `mesh` (the fields of `Mesh`) as JSON, and `bits` where the
-    sensor's camera states them: images of 16 bits are then divided by `2^bits - 1` before they are given to the model. The file
-    ends in its digest (`sealed`).
+    The model has standard operators only and a free batch size. It computes in float32, except for the solver of slack sheets,
+    which uses float64. On simulated images of the sensor at rest and pressed, it must give torch's statuses, and vertices
+    within 3e-5 of the surface's size. The model's metadata are `format`, `version` (of this package), `status_texts` and `mesh`
+    (the fields of `Mesh`) as JSON, and `bits` if the sensor's camera has that value: divide 16-bit images by `2^bits - 1`
+    before they are given to the model. The file ends with its digest (`sealed`).
 
     Args:
-        reconstructor: the sensor's.
-        path: the model's file.
-        tracking: follow the dots of the frames before; of a texture, which is not followed, the model is the same.
-        progress: is told how far it is, and the names of the pieces, some thirty; the last step is the check.
+        reconstructor: the sensor's reconstructor, in float32.
+        path: path of the model's file.
+        tracking: whether to track dots from frame to frame; it has no effect for texture, which is not tracked.
+        progress: called with the completed share and the name of the current piece (about thirty); the last step is the check.
 
     Returns:
-        The model. Input `image [batch, 1, height, width]`, grey in 0..1, of views that have images of their own one for each,
-        `image_NAME`; with `tracking`, of dots, also `previous_pixels [batch, D, 2]`, of W views `[batch, W, D, 2]`, NaN to
-        start from rest. Outputs as `Reconstruction`.
+        The model. Its input is `image [batch, 1, height, width]`, grey in 0..1; for views with images of their own there is one
+        input `image_NAME` for each. With `tracking` of dots there is also `previous_pixels [batch, D, 2]` (for W views
+        `[batch, W, D, 2]`), NaN to start from rest. Its outputs are the fields of `Reconstruction`.
 
     Raises:
-        MembraneError: a folder that does not exist, a reconstructor of another precision than float32, or one that cannot be
-            written, or is not the same when it is.
+        MembraneError: the folder does not exist, the reconstructor's precision is not float32, it cannot be exported, or the
+            model disagrees with torch.
     """
     if not Path(path).parent.is_dir():
         raise MembraneError(f"export: {path}: the folder {Path(path).parent} does not exist; make it first")
@@ -212,7 +213,7 @@ def export(
     if tracking and reconstructor.observer.follows:
         rest = reconstructor.rest_pixels
         before.append(tracer.given(PREVIOUS, rest.expand(EXAMPLES, *rest.shape).contiguous()))
-    inputs, values = images + before, cast(Any, images)  # stand for tensors
+    inputs, values = images + before, cast(Any, images)  # they stand for tensors
     with EXPORTER.at_work():
         given = [reconstructor.observer.sighted(pixels) for pixels in cast(Any, before)]
         result: Any = reconstructor.reconstruct_grey(values[0] if len(values) == 1 else values, *given)
@@ -224,7 +225,7 @@ def export(
 
 
 def image_inputs(reconstructor: Reconstructor) -> dict[str, tuple[int, int]]:
-    """Names of a model's images, each with width and height: one, or of each view that has images of its own."""
+    """Return the names of a model's image inputs with width and height: one, or one for each view with images of its own."""
     apart = reconstructor.sensor.views_apart
     if not apart:
         return {IMAGE: reconstructor.image_size}
@@ -232,10 +233,10 @@ def image_inputs(reconstructor: Reconstructor) -> dict[str, tuple[int, int]]:
 
 
 def sealed(content: bytes) -> bytes:
-    """A model's bytes, followed by its `doc_string`, which holds the SHA-256 digest of the bytes before it.
+    """Append a `doc_string` with the SHA-256 digest of a model's bytes to these bytes.
 
-    The fields of a protocol buffer may come in any order, so this is the same model. A damaged weight is found before the model
-    is run. Programs that write the model anew put the `doc_string` before the graph; their files are not checked.
+    The fields of a protocol buffer may be in any order, so this is still the same model. The digest reveals damaged weights
+    before the model is run. Programs that rewrite the model put the `doc_string` before the graph; such files are not checked.
 
     Example:
         >>> onnx.ModelProto.FromString(sealed(b"")).doc_string[:20]
@@ -246,7 +247,7 @@ def sealed(content: bytes) -> bytes:
 
 
 def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: Reconstructor) -> onnx.ModelProto:
-    """The model, its values described, from a `Reconstruction` of `Known` values."""
+    """Return the complete model with described inputs and outputs, from a `Reconstruction` of `Known` values."""
 
     def of_batch(name: str, value: Known, kind: int) -> onnx.ValueInfoProto:
         return described(name, kind, ["batch", *value.example.shape[1:]])
@@ -260,7 +261,7 @@ def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: R
 
 
 def metadata_of(reconstructor: Reconstructor) -> dict[str, str]:
-    """The metadata of a model on its sensor: texts by key."""
+    """Return a model's metadata about its sensor: texts by key."""
     mesh = Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, FORMATS[0]))._asdict()
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}

@@ -1,4 +1,4 @@
-"""One ONNX graph assembled from pieces; each piece is traced and stored once, also if it is repeated."""
+"""Assembly of one ONNX graph from pieces; a repeated piece is traced and stored once."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,15 +13,15 @@ from ..control_flow import NAMED
 from .trace import OPSET
 
 IR_VERSION = 8
-"""onnxruntime reads it, and the operators' set, from 1.14 on."""
+"""onnxruntime supports this version, and the operator set, since 1.14."""
 FEW = 64
-"""Numbers of a constant: more, in double precision, are stored in single precision if that holds them."""
+"""Larger double-precision constants are stored in single precision if that is lossless."""
 SPARSE_SIZE, SPARSE_SHARE = 4096, 0.7
-"""A constant of more numbers, of which less are not zero, is stored by these and the distances between their places."""
+"""A larger constant with a smaller share of nonzero numbers is stored as these numbers and the distances between them."""
 
 
 def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.ModelProto]) -> onnx.ModelProto:
-    """The model with the nodes of `onnx_function`s, of one input and output each, replaced by those of their models."""
+    """Replace the `onnx_function` nodes of a model, which have one input and one output each, by the nodes of their models."""
     graph, nodes, constants = model.graph, [], {}
     for node in graph.node:
         if node.domain != NAMED:
@@ -42,7 +42,7 @@ def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.Mo
 
 
 def renamed(nodes: Iterable[onnx.NodeProto], known: dict[str, str], prefix: str) -> list[onnx.NodeProto]:
-    """Copies of nodes. Names in `known`, which is extended by their outputs, are replaced; the others get a prefix."""
+    """Return copies of nodes with names replaced by `known`; other outputs get a prefix and are added to `known`."""
     copies = [_bare(node) for node in nodes]
     for name in (name for node in copies for name in node.output):
         known.setdefault(name, f"{prefix}/{name}" if name else "")
@@ -54,11 +54,12 @@ def renamed(nodes: Iterable[onnx.NodeProto], known: dict[str, str], prefix: str)
 
 
 class Assembly:
-    """An ONNX graph that grows by pieces; equal constants are kept once.
+    """An ONNX graph to which pieces are added; equal constants are stored once.
 
-    Nodes are named `PART/...` after the `part` at the time.
+    Nodes are named `PART/...` after the current `part`.
 
-    `append` and `loop` take a model from `traced_model` and the names that its inputs have here, and return its outputs' names.
+    `append` and `loop` take a model from `traced_model` and the names of its inputs in this graph, and return the names of its
+    outputs.
     """
 
     def __init__(self) -> None:
@@ -68,13 +69,13 @@ class Assembly:
         self.pieces, self.part = 0, ""
 
     def append(self, piece: onnx.ModelProto, names: dict[str, str]) -> dict[str, str]:
-        """Add the piece's nodes."""
+        """Add the nodes of a piece and return the names of its outputs."""
         nodes, outputs = self._renamed(piece, names)
         self.nodes.extend(nodes)
         return outputs
 
     def constant(self, array: np.ndarray) -> str:
-        """The name of a constant."""
+        """Add a constant if it is new, and return its name."""
         if array.dtype == np.float64 and array.size > FEW and np.array_equal(single := array.astype(np.float32), array):
             return self._widened(self.constant(single))
         nonzero = np.flatnonzero(array) if array.size > SPARSE_SIZE and array.dtype.kind == "f" else None
@@ -88,7 +89,7 @@ class Assembly:
         return self.constants[key].name
 
     def _scattered(self, array: np.ndarray, nonzero: np.ndarray) -> str:
-        """The name of a constant that is mostly zero, put together when the model is loaded."""
+        """Add a mostly zero constant, which is expanded when the model is loaded, and return its name."""
         distances = np.diff(nonzero, prepend=0)[:, None]
         parts = {
             "values": array.ravel()[nonzero],
@@ -112,19 +113,19 @@ class Assembly:
         return dense
 
     def _widened(self, name: str) -> str:
-        """The name of a constant in double precision, made of one in single precision when the model is loaded."""
+        """Return the name of a double-precision constant that is cast from a single-precision one when the model is loaded."""
         double = f"{name}/double"
         self.made.setdefault(double, [helper.make_node("Cast", [name], [double], to=TensorProto.DOUBLE)])
         return double
 
     def named(self, name: str, output: str) -> None:
-        """Give a value the name of an output."""
+        """Give a value the name `output`."""
         self.nodes.append(helper.make_node("Identity", [name], [output]))
 
     def loop(self, piece: onnx.ModelProto, names: dict[str, str], steps: int, tables: dict[str, np.ndarray]) -> dict[str, str]:
-        """Add a Loop of the piece, whose outputs, in order, are the next values of its first inputs.
+        """Add a Loop over a piece whose outputs, in order, are the next values of its first inputs.
 
-        `tables` hold, for further inputs, a row for every step; inputs not in them keep their value.
+        For further inputs, `tables` has a row for every step; inputs that are not in `tables` keep their value.
         """
         k, count = f"{self.part}/{self.pieces}", len(piece.graph.output)
         state = [value.name for value in piece.graph.input][:count]
@@ -147,10 +148,10 @@ class Assembly:
 
     @contextmanager
     def cond(self, condition: str, names: dict[Any, str], kinds: Sequence[int]) -> Iterator[None]:
-        """Pieces appended inside run only if `condition` (bool) is false.
+        """Run the pieces that are appended within this context only if `condition` (bool) is false.
 
-        `names` are values outside, with their element types; inside they are set to the names of their replacements. After the
-        block they name the chosen values.
+        `names` are the names of values before the context, and `kinds` their element types. Within the context, set `names` to
+        the names of the replacements; afterwards they name the chosen values.
         """
         k, before, outside = f"{self.part}/{self.pieces}", dict(names), self.nodes
         self.nodes = []
@@ -170,7 +171,7 @@ class Assembly:
     def model(
         self, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto], metadata: dict[str, str]
     ) -> onnx.ModelProto:
-        """The whole as a checked model of such inputs and outputs, with metadata."""
+        """Return the graph as a checked model with these inputs, outputs and metadata."""
         nodes = [*chain.from_iterable(self.made.values()), *self.nodes]
         graph = helper.make_graph(nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
         _shorten(graph, {value.name: value.name for value in [*inputs, *outputs]} | {"": ""})
@@ -181,7 +182,7 @@ class Assembly:
         return model
 
     def _renamed(self, piece: onnx.ModelProto, names: dict[str, str]) -> tuple[list[onnx.NodeProto], dict[str, str]]:
-        """Copies of the piece's nodes under names of their own, and its outputs' names here."""
+        """Return copies of a piece's nodes with unique names, and the names of its outputs in this graph."""
         known, k = dict(names), f"{self.part}/{self.pieces}"
         self.pieces += 1
         for tensor in piece.graph.initializer:
@@ -191,14 +192,16 @@ class Assembly:
 
 
 def described(name: str, kind: int = TensorProto.FLOAT, shape: Sequence[str | int] | None = None) -> onnx.ValueInfoProto:
-    """A value's description, as ONNX declares it: its name, element type and shape (None: not said; strings: free lengths)."""
+    """Return the ONNX description of a value: name, element type and shape (None: unspecified; strings: free lengths)."""
     description: onnx.ValueInfoProto = helper.make_tensor_value_info(name, kind, shape)
     return description
 
 
 def _shorten(graph: onnx.GraphProto, names: dict[str, str]) -> None:
-    """Replace the names of values by numbers, except those in `names`, which is extended, and number the nodes of each part.
-    The original names would be a quarter of the file."""
+    """Replace the names of values by numbers, except those in `names`, which is extended; name nodes by part and number.
+
+    The original names would take a quarter of the file.
+    """
     parts = [node.name.partition("/")[0] for node in graph.node]
     for value in chain(graph.initializer, graph.input, graph.output):
         value.name = names.setdefault(value.name, f"v{len(names):x}")
@@ -212,7 +215,7 @@ def _shorten(graph: onnx.GraphProto, names: dict[str, str]) -> None:
 
 
 def _bare(node: onnx.NodeProto) -> onnx.NodeProto:
-    """The node without its name and the exporter's notes."""
+    """Return a copy of the node without its name and the exporter's notes."""
     copy = onnx.NodeProto()
     copy.CopyFrom(node)
     for field in ("metadata_props", "doc_string", "name"):

@@ -1,8 +1,8 @@
-"""The private parts of torch on which the export depends; no other file of the package uses any.
+"""The private parts of torch on which the export depends; no other file of the package uses private parts of torch.
 
-With public functions alone, `torch.export.export` and `torch.onnx.export`, the models are the same, but an export takes several
-times as long. Private parts may change with every version of torch: `CHECKED` are the versions with which they were tried, and
-`tests/test_torch_internals.py` names each one that is missing or works differently.
+With the public functions `torch.export.export` and `torch.onnx.export` alone, the models are the same, but an export takes
+several times as long. Private parts may change with every version of torch: `CHECKED` lists the versions that were tested, and
+`tests/test_torch_internals.py` reports each part that is missing or works differently.
 """
 
 import logging
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from ..errors import MembraneError
 
 CHECKED = ("2.13.0",)
-"""Versions of torch."""
+"""Tested versions of torch."""
 
 try:
     from onnx_ir.schemas import OpSignature
@@ -53,7 +53,7 @@ __all__ = ["CHECKED", "TorchExporter", "empty_batches", "replaced", "tree_flatte
 
 
 def empty_batches(values: Iterable[Tensor], frames: int) -> tuple[Tensor, ...]:
-    """Tensors for tracing that take no memory: like the values, but with a batch of this length (scalars have none)."""
+    """Return tensors for tracing that take no memory: like the values, but with a batch of this length (except scalars)."""
     with FakeTensorMode(allow_non_fake_inputs=True):
         return tuple(
             torch.empty(frames, *value.shape[1:], dtype=value.dtype) if value.ndim else torch.empty_like(value)
@@ -63,10 +63,10 @@ def empty_batches(values: Iterable[Tensor], frames: int) -> tuple[Tensor, ...]:
 
 @contextmanager
 def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Replace an attribute of a module or a class within a block, and restore it afterwards.
+    """Replace an attribute of a module or a class within this context, and restore it afterwards.
 
     Raises:
-        MembraneError: it has no such attribute of its own.
+        MembraneError: the module or class does not define this attribute.
     """
     if name not in vars(owner):
         raise MembraneError(
@@ -82,10 +82,10 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 
 class TorchExporter:
-    """Torch's exporter to ONNX without the work that it repeats for every model.
+    """Torch's ONNX exporter without the work that it repeats for every model.
 
     Args:
-        translations: by operator of torch, a function that writes it in ONNX, in place of torch's own.
+        translations: functions that translate operators of torch to ONNX, by operator; they replace torch's own.
     """
 
     def __init__(self, translations: dict[Any, Callable[..., Any]]) -> None:
@@ -95,7 +95,7 @@ class TorchExporter:
         self._from_torchlib = ONNXRegistry.from_torchlib
 
     def _registry(self, **options: Any) -> ONNXRegistry:
-        """The operators of torch's exporter and the translations. Torch reads them anew for every model, a second each."""
+        """Return torch's operators with the translations, cached: torch would read them for every model, a second each."""
         key = tuple(options.items())
         if key not in self._registries:
             self._registries[key] = self._from_torchlib(**options)
@@ -105,33 +105,33 @@ class TorchExporter:
 
     @cached_property
     def _decompositions(self) -> tuple[dict[Any, Any], ...]:
-        """Decompositions of operators that ONNX lacks."""
+        """Decompositions of operators that are missing in ONNX."""
         table: dict[Any, Any] = create_onnx_friendly_decomposition_table(set(get_onnx_implemented_overloads(self._registry())))
         return _split_decomp_table_to_cia_and_python_decomp(table)
 
     def captured(self, module: nn.Module, examples: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
-        """The module as a program of operators that ONNX has; to be called within `at_work`.
+        """Capture the module as a program of operators that exist in ONNX; call this method within `at_work`.
 
-        Torch's exporter captures a program of its own operators first, and decomposes these in a second step.
+        Torch's exporter first captures a program of its own operators, and decomposes them in a second step.
         """
         _, decomposed = self._decompositions
         at_once = partial(_trace._export_to_aten_ir, decomp_table=decomposed)
         with ExitStack() as stack:
             stack.enter_context(replaced(_trace, "_export_to_aten_ir", at_once))
             stack.enter_context(replaced(_trace, "_aot_export_joint_with_descriptors", _captured_once))
-            stack.enter_context(replaced(torch.fx.config, "do_not_emit_stack_traces", True))  # no model holds them
+            stack.enter_context(replaced(torch.fx.config, "do_not_emit_stack_traces", True))  # models do not contain them
             return _trace._export(module, examples, strict=False, pre_dispatch=False)
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
-        """Make `torch.onnx.export` of a `captured` program skip the repeated work, within a block.
+        """Make `torch.onnx.export` of a `captured` program skip repeated work within this context.
 
-        Blocks may be nested; the outer one then prepares everything.
+        Contexts may be nested; the outer one prepares everything.
         """
         if self._is_at_work:
             yield
             return
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # of torchvision, which is not needed
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns about torchvision, which is not needed
         with ExitStack() as stack:
             self._is_at_work = True
             stack.callback(setattr, self, "_is_at_work", False)
@@ -155,9 +155,9 @@ def _captured_once(
     decompositions: dict[Any, Any],
     **_: Any,
 ) -> tuple[torch.fx.GraphModule, GraphSignature]:
-    """The operators of a module that changes none of its tensors, and descriptions of its inputs and outputs.
+    """Return the operators of a module that modifies none of its tensors, and descriptions of its inputs and outputs.
 
-    Torch's own function runs the module a first time, to find what it changes.
+    Torch's own function runs the module an additional time, to find which tensors it modifies.
     """
     parameters, buffers = ([FQN(name) for name, _ in named()] for named in (module.named_parameters, module.named_buffers))
     held = [*parameters, *buffers]
@@ -174,7 +174,7 @@ def _captured_once(
     graph.recompile()
     *nodes, output = graph.graph.nodes
     for node in nodes:
-        node.meta.setdefault("nn_module_stack", {})  # the modules that it stands in, which the model does not tell
+        node.meta.setdefault("nn_module_stack", {})  # the enclosing modules, which the model does not contain
     inputs = [node.name for node in nodes if node.op == "placeholder"]
     returned, structure = tree_flatten(output.args[0])
     signature = GraphSignature(
@@ -205,18 +205,20 @@ def _signature_of(name: str, domain: str, version: int) -> OpSignature:
 
 
 def _signature(schema: onnx.defs.OpSchema) -> OpSignature:
-    """The signature of an ONNX operator, cached because torch's exporter reads it anew for every node."""
+    """Return the signature of an ONNX operator, cached because torch's exporter reads it again for every node."""
     return _signature_of(schema.name, schema.domain, schema.since_version)
 
 
 def _as_it_is(program: torch.export.ExportedProgram, registry: ONNXRegistry) -> torch.export.ExportedProgram:
-    """A program that is `captured`, decomposed already."""
+    """Return the `captured` program unchanged, because it is already decomposed."""
     return program
 
 
 def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> Any:
-    """The exporter's pass that gives the operands of a node one type; torch's also computes again what it leaves as it is, a
-    fifth of the time of tracing."""
+    """Promote the operands of a node to a common type, as a pass of torch's exporter does.
+
+    Torch's pass also recomputes nodes that it leaves unchanged, which takes a fifth of the time of tracing.
+    """
     if node.op != "call_function":
         return torch.fx.Interpreter.run_node(interpreter, node)
     with interpreter._set_current_node(node):

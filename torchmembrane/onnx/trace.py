@@ -1,4 +1,4 @@
-"""A piece of torch code traced to an ONNX graph of its own with a free batch length."""
+"""Tracing of a piece of torch code to an ONNX graph with a free batch size."""
 
 import warnings
 from typing import Any
@@ -20,11 +20,11 @@ from .torch_internals import TorchExporter, empty_batches
 
 OPSET = 18
 MANY = 1_000_003
-"""A prime: the length of the batch that is traced. Nothing of that size is made."""
+"""The batch size for tracing, a prime; no tensor of that size is allocated."""
 HUGE = (1 << 31) - 1
-"""Values beyond it stand for the end of an axis and are not lengths."""
+"""Values from here on mean the end of an axis and are not lengths."""
 LENGTHS = 8
-"""Numbers that are lengths, at most, in a tensor."""
+"""Largest number of elements of a tensor of lengths."""
 NUMBERS = (ir.AttributeType.INT, ir.AttributeType.INTS, ir.AttributeType.FLOAT, ir.AttributeType.FLOATS)
 
 TIDY = passes.Sequential(
@@ -35,11 +35,11 @@ TIDY = passes.Sequential(
     common.OutputFixPass(),
     common.NameFixPass(),
 )
-"""The passes of torch's exporter without its patterns, which take most of its time and change hardly anything here."""
+"""The passes of torch's exporter without its pattern rewriting, which takes most of the time and changes hardly anything."""
 
 
 def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:
-    """`torch.scalar_tensor` as ONNX."""
+    """Translate `torch.scalar_tensor` to ONNX, keeping double precision."""
     if dtype != TensorProto.DOUBLE or not isinstance(s, float):
         return aten_scalar_tensor(s, dtype, layout, device, pin_memory)
     number: Any = ir.tensor(s, dtype=ir.DataType.DOUBLE)
@@ -47,7 +47,10 @@ def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: 
 
 
 def _selected(self: Any, dim: int, index: Any) -> Any:
-    """`torch.index_select` as ONNX; along the last axis entry by entry: onnxruntime is slow at many slices of one."""
+    """Translate `torch.index_select` to ONNX.
+
+    Along the last axis, entries are gathered one by one, because onnxruntime is slow with many slices of length one.
+    """
     *others, _ = self.shape
     if dim % len(self.shape) < len(others):
         return aten_index_select(self, dim, index)
@@ -57,21 +60,21 @@ def _selected(self: Any, dim: int, index: Any) -> Any:
 
 
 EXPORTER = TorchExporter({torch.ops.aten.scalar_tensor.default: _number, torch.ops.aten.index_select.default: _selected})
-"""With numbers in double precision, which torch's own rounds to single, and rows selected as onnxruntime is quick at."""
+"""The exporter, with scalars in double precision (torch rounds them to single) and an `index_select` fast in onnxruntime."""
 
 
 def traced_model(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
-    """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none).
+    """Trace a module to ONNX, with named inputs and outputs; the first axis of every input except scalars is the batch.
 
-    Traced is a batch of `MANY` frames, a length that nothing else has, and what the graph then holds of it is made free. With a
-    length that is a symbol torch takes three times as long.
+    The module is traced with a batch of `MANY` frames, a length that nothing else has; occurrences of this length in the graph
+    are then replaced by the actual batch size. With a symbolic length, torch takes three times as long.
 
     Raises:
-        ValueError: a number, not a length, depends on the batch's length.
+        ValueError: a number that is not a length depends on the batch size.
     """
     examples = empty_batches(inputs.values(), MANY)
     with warnings.catch_warnings(), EXPORTER.at_work(), writing():
-        warnings.simplefilter("ignore")  # of the exporter about itself
+        warnings.simplefilter("ignore")  # of the exporter about its own code
         program = torch.onnx.export(
             EXPORTER.captured(module.eval(), examples),
             input_names=list(inputs),
@@ -82,19 +85,19 @@ def traced_model(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str
             verbose=False,
             optimize=False,
         )
-    assert program is not None  # it is None only of the exporter before dynamo
+    assert program is not None  # only the exporter without dynamo returns None
     common.InlinePass()(program.model)
     fold_constants_ir(program.model, should_fold=_is_constant)
     _free(program.model.graph)
     _leave_out_ones(program.model.graph)
     TIDY(program.model)
-    for value, name in zip(program.model.graph.inputs, inputs, strict=True):  # one that is an output too has lost its name
+    for value, name in zip(program.model.graph.inputs, inputs, strict=True):  # inputs that are also outputs lost their names
         value.name = name
     return program.model_proto
 
 
 def _is_constant(node: ir.Node) -> bool | None:
-    """False of what is as long as the batch; None leaves it, and lengths put together, to the pass."""
+    """Return False for nodes that would make a constant of the batch's length; None leaves the decision to the pass."""
     if node.op_type == "Concat":
         return None
     lengths = (None if value is None else ir.convenience.get_const_tensor(value) for value in node.inputs)
@@ -103,10 +106,10 @@ def _is_constant(node: ir.Node) -> bool | None:
 
 
 def _free(graph: ir.Graph) -> None:
-    """Lengths that are the batch's, or multiples of it, as constants of the graph, become what the batch has.
+    """Replace constants that are lengths and multiples of the traced batch size by values computed from the actual batch size.
 
     Raises:
-        ValueError: a number that is no length is a multiple.
+        ValueError: a number that is not a length is a multiple of the traced batch size.
     """
     length: ir.Value | None = None
     for node in list(graph):
@@ -139,7 +142,7 @@ def _free(graph: ir.Graph) -> None:
 
 
 def _leave_out_ones(graph: ir.Graph) -> None:
-    """Products with the number 1, which torch's exporter makes of `addcmul` and others, are what they are made of."""
+    """Remove products with the number 1, which torch's exporter makes of `addcmul` and others."""
     for node in [node for node in graph if node.op_type == "Mul" and not node.outputs[0].is_graph_output()]:
         for value, other in (node.inputs, node.inputs[::-1]):
             constant = None if value is None else ir.convenience.get_const_tensor(value)
@@ -150,13 +153,13 @@ def _leave_out_ones(graph: ir.Graph) -> None:
 
 
 def _depends(numbers: np.ndarray) -> bool:
-    """Whether one of them is a multiple of the length of the batch that is traced."""
+    """Return whether any of the numbers is a multiple of the traced batch size."""
     wide = numbers.dtype.kind in "if" and numbers.dtype.itemsize > 2
     return bool(wide and (numbers[(numbers >= MANY) & (numbers < HUGE)] % MANY == 0).any())
 
 
 def _lengths(numbers: np.ndarray, of_batch: np.ndarray, length: ir.Value) -> list[ir.Node]:
-    """Nodes whose last one gives the numbers, of which some are multiples of the batch's `length [1]`."""
+    """Return nodes, the last of which computes the numbers, with multiples of the traced batch size taken of `length [1]`."""
     times, plus = np.where(of_batch, numbers // MANY, 0), np.where(of_batch, 0, numbers)
     constants = [ir.node("Constant", [], {"value": ir.tensor(each.reshape(-1))}) for each in (times, plus)]
     product = ir.node("Mul", [length, constants[0].outputs[0]])

@@ -10,7 +10,7 @@ PREFIX = "preset:"
 
 
 def preset_file(name: str) -> Path:
-    """The `sensor.toml` of a preset.
+    """Return the path of a preset's `sensor.toml`.
 
     Args:
         name: one of `NAMES`.
@@ -29,7 +29,7 @@ def preset_file(name: str) -> Path:
 
 @check_arguments
 def preset(name: str) -> Sensor:
-    """A sensor that comes with the package.
+    """Return a preset sensor, which comes with the package.
 
     Args:
         name: "fingertip", "bubble" or "half_cylinder".
@@ -48,7 +48,7 @@ def preset(name: str) -> Sensor:
 
 
 def sensor_file(text: str) -> Path:
-    """The file that an argument names.
+    """Return the path of the sensor file that a command-line argument names.
 
     Args:
         text: a path, or `preset:NAME`.

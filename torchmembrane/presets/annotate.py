@@ -1,4 +1,4 @@
-"""Comments in a drafted sensor file: `torchmembrane init` explains every key for users who continue from it."""
+"""Comments in a drafted sensor file, with which `torchmembrane init` explains every key."""
 
 import re
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ WORDS = {
         "rest_image": "nothing touches; or a list of images, or a pattern with *, averaged",
     },
 }
-"""By table and key, what stands behind a key's value."""
+"""Comments by table and key."""
 RELATIVE = """\
 # shear_modulus = {modulus:<6g} # N / length unit^2; without it and thickness forces are relative. From one known weight:
 # thickness = {thickness:<10g} # torchmembrane calibrate material sensor.toml press.png --weight 200g --out material"""
@@ -72,7 +72,7 @@ FURTHER = """\
 # [tool]               # the camera's pose on a robot: p_tool = rotation p_camera + translation
 # rotation = [0, 0, 0] # rotation vector, degrees; or three rows of three
 # translation = [0.0, 0.0, 0.0]"""
-OF_EXAMPLES = {"thickness": 0.5, "distance": 2.0, "window": 3.0}  # mm, of the keys that are commented out
+OF_EXAMPLES = {"thickness": 0.5, "distance": 2.0, "window": 3.0}  # mm, values of keys that are commented out
 MODULUS = 0.3  # N / mm^2
 OF_SHEETS = {
     "prestretch": "of the sheet in its rim before it is blown up, over the unstretched sheet, 1 or more",
@@ -85,10 +85,10 @@ def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None
     """Add comments to the keys of a sensor file, and further possible keys at its end, commented out.
 
     Args:
-        path: what `Sensor.to_file` wrote.
-        said: sentences for its top: what was assumed or derived.
-        relative: whether its forces are, so that it shows the keys that give newtons.
-        unit: unit of its lengths, in which the examples of further keys are.
+        path: path of a file that `Sensor.to_file` has written.
+        said: sentences for its top, on assumed or derived values.
+        relative: whether forces are relative, so that the keys that give newtons are added as comments.
+        unit: length unit of the file, in which the values of further keys are given.
     """
     one = millimetre(unit)
     examples = {name: length * one for name, length in OF_EXAMPLES.items()} | {"modulus": MODULUS / one**2}

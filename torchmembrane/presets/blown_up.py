@@ -1,4 +1,4 @@
-"""An inflated sheet from a ruler and a gauge: its rim, height, overpressure, prestretch and stiffness determine one another."""
+"""Draft of an inflated sheet from measurements: rim, height, overpressure, prestretch and stiffness are interdependent."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -17,14 +17,14 @@ from ..sensor.units import hectopascal
 
 ASSUMED_PRESTRETCH = 1.1
 ASSUMED = f"prestretch {ASSUMED_PRESTRETCH:g} of the sheet in its rim is assumed; --prestretch states it"
-DISAGREEMENT = 0.1  # between the overpressure stated and the one that the other numbers hold, relative: above, it is said
+DISAGREEMENT = 0.1  # relative difference between stated and computed overpressure above which it is reported
 LARGEST_STRETCH = 3.0
-MARGIN = 0.4  # of a pitch, at least between a dot and the rim
+MARGIN = 0.4  # smallest distance between a dot and the rim, over the pitch
 
 
 class BlownUp(NamedTuple):
-    """A drafted sheet: its surface, its material, the overpressure that it holds (hPa; None: not known), and what was assumed,
-    derived, or contradicts, in sentences."""
+    """A drafted sheet: its surface, its material, its overpressure at rest (hPa; None if unknown), and sentences on assumed,
+    derived or contradictory values."""
 
     surface: InflatedSurface
     material: Material
@@ -33,8 +33,8 @@ class BlownUp(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What is known of a sheet, None where it is not: height, overpressure (hPa), prestretch, shear modulus (N per length unit
-    squared) and thickness of the sheet as it is stretched in its rim."""
+    """The known values of a sheet, None if unknown: height, overpressure (hPa), and for the sheet stretched in its rim
+    prestretch, shear modulus (N per length unit squared) and thickness."""
 
     height: float | None = None
     overpressure: float | None = None
@@ -44,21 +44,22 @@ class Stated(NamedTuple):
 
 
 def blown_up(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
-    """The neo-Hookean sheet that was stated, and what follows from it.
+    """Complete the known values of a neo-Hookean sheet.
 
-    Of height, overpressure, prestretch and shear modulus x thickness any three give the fourth; without the overpressure, or
-    the modulus, forces are relative. What is given beyond that is compared.
+    Any three of height, overpressure, prestretch and shear modulus x thickness determine the fourth. If both overpressure and
+    modulus are unknown, forces are relative. If all four are given, they are compared.
 
     Args:
-        rim: `outline`, `size`, `corner` and `base_z` as of `InflatedSurface`.
+        rim: `outline`, `size`, `corner` and `base_z` as in `InflatedSurface`.
         unit: unit of length.
-        stated: what is known.
+        stated: the known values.
 
     Returns:
-        The sheet, and sentences about it.
+        The sheet, and sentences on its values.
 
     Raises:
-        MembraneError: neither height nor overpressure, an overpressure without height and modulus, or no equilibrium.
+        MembraneError: neither height nor overpressure is given, an overpressure is given without height and modulus, or there
+            is no equilibrium.
 
     Example:
         >>> rim = {"outline": "ellipse", "size": [50.0, 36.0], "base_z": 40.0}
@@ -75,7 +76,7 @@ def blown_up(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
     points = _surface(rim, unit, {"height": height}, Material("neo_hookean", 1.0)).rim
 
     def held(stretch: float) -> float:
-        """Over shear modulus x thickness."""
+        """Return the equilibrium pressure over shear modulus x thickness."""
         return formed_surface(points, SheetMaterial("neo_hookean", stretch), height=height).pressure
 
     modulus = None if shear_modulus is None or thickness is None else shear_modulus * thickness
@@ -147,7 +148,7 @@ def _contradiction(holds: float, stated: Stated) -> list[str]:
 
 
 def _split(product: float, thickness: float | None, modulus: float | None, unit: str) -> tuple[float, float, str]:
-    """Thickness and shear modulus of a product; which of them followed, in words."""
+    """Split the product into thickness and shear modulus; return both, and a phrase that says which one was derived."""
     if modulus is not None:
         return float(f"{product / modulus:.6g}"), modulus, f"thickness {product / modulus:.4g} {unit}"
     if thickness is not None:
@@ -164,14 +165,14 @@ def _in_words(formed: FormedSurface, unit: str) -> list[str]:
 
 
 def sheet_dots(surface: InflatedSurface, pitch: float) -> tuple[np.ndarray, list[str]]:
-    """A square pattern of alternating large and small dots, drawn on the sheet within its rim before it is inflated.
+    """Return a square pattern of alternating large and small dots, drawn on the sheet in its rim before inflation.
 
     Args:
         surface: the rest surface.
         pitch: pitch of the pattern on the stretched sheet, length unit.
 
     Returns:
-        Positions `[D, 3]` on the rest surface, camera's frame, and sizes.
+        Positions of the dots on the rest surface, `[D, 3]`, camera's frame, and their sizes.
     """
     formed, outline = surface.formed, surface.formed.outline
     reach = np.abs(outline.points).max(0) // pitch
@@ -187,7 +188,7 @@ def sheet_dots(surface: InflatedSurface, pitch: float) -> tuple[np.ndarray, list
 
 
 def _distance(rim: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """From `points [D, 2]` to the nearest side of a closed polygon."""
+    """Return the distances of `points [D, 2]` from the nearest side of a closed polygon, `[D]`."""
     a, along = rim[None], (np.roll(rim, -1, 0) - rim)[None]
     to = points[:, None] - a
     share = ((to * along).sum(-1) / (along**2).sum(-1)).clip(0, 1)

@@ -1,4 +1,4 @@
-"""How the presets are made: `python -m torchmembrane.presets.design` writes their files anew."""
+"""Design of the presets: `python -m torchmembrane.presets.design` writes their files."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,12 +20,12 @@ from ..simulate.render import Renderer
 from . import NAMES
 
 AIR = 1013.0  # hPa
-MARGIN = 0.93  # of the way from pole to rim that is dotted
+MARGIN = 0.93  # share of the arc from pole to rim that has dots
 NOISE_LEVEL = 40.0  # dB below white
 
 
 def fingertip() -> Sensor:
-    """Half an ellipsoid as large as a fingertip, a fisheye camera within it, filled with liquid."""
+    """Return a half ellipsoid of the size of a fingertip, filled with liquid, with a fisheye camera inside."""
     semi_axes = [10.0, 8.0, 12.0]
     return _sensor(
         "fingertip",
@@ -37,7 +37,7 @@ def fingertip() -> Sensor:
 
 
 def bubble() -> Sensor:
-    """A wide air-filled bubble seen by a pinhole camera from afar."""
+    """Return a wide air-filled bubble seen by a distant pinhole camera."""
     rim, height, base_z = 30.0, 18.0, 60.0
     radius = (rim**2 + height**2) / (2 * height)
     return _sensor(
@@ -51,7 +51,7 @@ def bubble() -> Sensor:
 
 
 def half_cylinder() -> Sensor:
-    """A water-filled half cylinder, longer than wide, seen through a pane of Plexiglas: the paper's Appendix A."""
+    """Return a long water-filled half cylinder seen through a Plexiglas window, as in the paper's Appendix A."""
     radius, length, half_angle, base_z, spacing = 10.0, 36.0, 80.0, 24.0, 2.4
     return _sensor(
         "half_cylinder",
@@ -63,7 +63,7 @@ def half_cylinder() -> Sensor:
 
 
 def write(folder: Path) -> None:
-    """The files of every preset: `NAME/sensor.toml`, `sensor_dots.csv`, `sensor_rest.png`."""
+    """Write the files of every preset: `NAME/sensor.toml`, `sensor_dots.csv`, `sensor_rest.png`."""
     from tqdm import tqdm
 
     for name in tqdm(NAMES, desc="presets", unit="sensor"):
@@ -79,7 +79,7 @@ def _sensor(
     sizes: list[str],
     gas: bool = False,
 ) -> Sensor:
-    """A sensor with the rest image that the renderer makes of it."""
+    """Return a sensor with a rendered rest image."""
     markers = Markers("dots", "dark", positions, sizes)
     membrane = surface.membrane(default_grid(markers))
     blank = Sensor(name, "mm", camera, membrane, material, Cavity("liquid"), markers, surface)
@@ -90,13 +90,13 @@ def _sensor(
 
 
 def _overpressure(sensor: Sensor) -> float:
-    """What the membrane's tension holds at rest, whole hPa."""
+    """Return the overpressure that balances the membrane's tension at rest, rounded to whole hPa."""
     rest_pressure, _ = rest_balance(sensor.membrane, elastic_energy(sensor, sensor.membrane))
     return float(round(float(rest_pressure) * METRE["mm"] ** 2 / 100))
 
 
 def dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
-    """A square pattern, its pitch measured along the surface from the pole: positions `[D, 3]` and sizes, in turns."""
+    """Return a square pattern of alternating dots, spaced along the surface from the pole: positions `[D, 3]` and sizes."""
     a, b, c = semi_axes
     i, j = _lattice(opening * max(a, b) / spacing)
     x, y = i * spacing / a, j * spacing / b
@@ -110,7 +110,7 @@ def dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacing
 def cylinder_dots(
     radius: float, length: float, half_angle: float, base_z: float, spacing: float
 ) -> tuple[np.ndarray, list[str]]:
-    """A square pattern on the unrolled cylinder: positions `[D, 3]` and sizes, in turns."""
+    """Return a square pattern of alternating dots on the unrolled cylinder: positions `[D, 3]` and sizes."""
     i, j = _lattice(length / spacing)
     x, angle = i * spacing, j * spacing / radius
     points = np.stack([x, radius * np.sin(angle), base_z + radius * (np.cos(angle) - np.cos(half_angle))], -1)
@@ -119,7 +119,7 @@ def cylinder_dots(
 
 
 def _lattice(reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Whole steps `i, j` of a square lattice, up to `reach` from its middle both ways."""
+    """Return the integer steps `i, j` of a square lattice, up to `reach` from its centre in each direction."""
     steps = np.arange(-int(reach), int(reach) + 1)
     i, j = np.meshgrid(steps, steps, indexing="ij")
     return i.ravel(), j.ravel()

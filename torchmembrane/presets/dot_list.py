@@ -1,4 +1,4 @@
-"""Dots as users list them in various frames, placed on the membrane in the camera's frame."""
+"""Read lists of dots in various frames, and place the dots on the membrane in the camera's frame."""
 
 from pathlib import Path
 
@@ -15,32 +15,33 @@ from ..sensor.marker_checks import OFF_SURFACE
 from ..sensor.parts import Surface
 from ..sensor.toml import COORDINATE, MOST_DOTS, MOST_DOTS_BYTES, SIZES
 
-FINE = (97, 97)  # vertices of the surface on which dots are put
-RAYS = (("x", "y"), ("angle", "azimuth"), ("u", "v"))  # columns of dots that a ray puts on the surface
+FINE = (97, 97)  # grid of the surface on which dots are placed
+RAYS = (("x", "y"), ("angle", "azimuth"), ("u", "v"))  # columns of dots that are placed along a ray
 POINTS = (("x", "y", "z"), ("x", "y", "h"))
 LIMITS = {"x": COORDINATE, "angle": ANGLE, "u": ANY}
-"""Limits of the numbers of a form, by its first column."""
+"""Limits of the numbers, by the first column of the table."""
 SIZE = "size"
 DOTS = Columns((*POINTS, *RAYS), "dot", SIZE, least=FEWEST_MARKERS, most=MOST_DOTS)
 
 
 def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.ndarray, list[str]]:
-    """Dots from a table whose header says in which frame they are.
+    """Read dots from a table whose header names the frame.
 
-    `x,y,z` camera frame; `x,y,h` h above the rim's plane; `x,y` from above, the height is the membrane's; `angle,azimuth`
-    degrees from the pole and about the axis (from x to y), seen from the rim's centre; `u,v` px in the image at rest. A further
-    column `size`: small or large (default: small).
+    `x,y,z`: positions in the camera's frame. `x,y,h`: h is the height above the rim's plane. `x,y`: seen from above; the dots
+    are placed on the membrane. `angle,azimuth`: degrees from the pole and about the axis (from x to y), seen from the rim's
+    centre. `u,v`: pixels in the rest image. An optional column `size` is "small" (default) or "large".
 
     Args:
         path: path of the CSV file.
         surface: the rest surface.
-        camera: for `u,v`.
+        camera: the camera, for `u,v`.
 
     Returns:
-        Positions `[D, 3]` in the camera's frame, and sizes.
+        Positions of the dots in the camera's frame, `[D, 3]`, and their sizes.
 
     Raises:
-        MembraneError: the file cannot be read, has another header, or a dot whose ray misses the membrane: the line is named.
+        MembraneError: the file cannot be read, its header is unknown, or a dot's ray misses the membrane; the message names the
+            line.
     """
     form, rows = read_table(path, DOTS, MOST_DOTS_BYTES)
     values = np.array([row.numbers(form, LIMITS[form[0]]) for row in rows])
@@ -62,7 +63,7 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
 
 
 def rim_z(surface: Surface) -> float:
-    """The z of the rim's plane; of a tilted or bent rim that of its middle."""
+    """Return the z of the rim's plane, or the mean z of a tilted or curved rim."""
     if isinstance(surface, InflatedSurface):
         return float(surface.rim[:, 2].mean())
     base_z: float = surface.values["base_z"]
@@ -70,7 +71,7 @@ def rim_z(surface: Surface) -> float:
 
 
 def _refuse_heights(path: Path, surface: Surface, values: np.ndarray) -> None:
-    """Refuse positions `[D, 3]` that lie on the membrane if they are taken from the rim's plane."""
+    """Raise an error if positions `[D, 3]` fit the membrane only when z is measured from the rim's plane."""
     membrane, base_z = surface.membrane(FINE), rim_z(surface)
     off, off_as_heights = (membrane.closest_points(points).distance.max() for points in (values, values + [0.0, 0.0, base_z]))
     if off_as_heights < OFF_SURFACE * membrane.size < off:
@@ -81,7 +82,7 @@ def _refuse_heights(path: Path, surface: Surface, values: np.ndarray) -> None:
 
 
 def _rays(form: tuple[str, ...], values: np.ndarray, base_z: float, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Rays on which dots lie, origins and directions `[D, 3]`."""
+    """Return origins and directions of the rays on which dots lie, `[D, 3]` each."""
     a, b = values.T
     if form == ("u", "v"):
         rays = camera.pixel_to_ray(torch.from_numpy(values))

@@ -1,5 +1,4 @@
-"""A sensor drafted from a few numbers: rest surface, camera on its axis, material in balance with the pressure, a pattern of
-dots."""
+"""Draft of a sensor from a few numbers: rest surface, camera on its axis, material in equilibrium, and a dot pattern."""
 
 import math
 from collections.abc import Mapping
@@ -30,23 +29,23 @@ SHAPES: dict[str, tuple[str, ...]] = {
     "ellipse": ("size", "height"),
     "outline": ("height",),
 }
-"""The shapes that are drafted, and the lengths that each needs; the last three are sheets that are blown up, `blown_up`."""
+"""Shapes that can be drafted, and the lengths that each needs; the last three are inflated sheets (`blown_up`)."""
 SHEETS = ("rectangle", "ellipse", "outline")
 ASSUMED_PRESTRETCH = 1.2
 LARGEST_STRETCH = 4.0
 DECIMALS = 9  # of a distance
-PITCHES = 11  # of dots across the square root of the area, where nothing else is said
+PITCHES = 11  # default number of pitches across the square root of the area
 PRESSURE_UNITS = {"Pa": 0.01, "hPa": 1.0, "mbar": 1.0, "kPa": 10.0, "bar": 1000.0, "psi": 68.94757}  # in hPa
 
 
 def drafted_surface(shape: str, numbers: Mapping[str, float | list[float]], base_z: float) -> Surface:
-    """The rest surface of one of the `SHAPES` that are not inflated sheets.
+    """Return the rest surface of one of the `SHAPES` that are not inflated sheets.
 
     Args:
         shape: "dome" (half a sphere) | "cap" | "bubble" (a cap of gas) | "fingertip" (half an ellipsoid) | "half_cylinder".
-        numbers: lengths: `radius` of the sphere, of the cap's rim or of the cylinder; `height`; `semi_axes`; `length`;
-            `half_angle` (degrees, default 90).
-        base_z: the rim's distance from the camera.
+        numbers: dimensions by name: `radius` of the sphere, of the cap's rim or of the cylinder; `height`; `semi_axes`;
+            `length`; `half_angle` (degrees, default 90).
+        base_z: distance of the rim from the camera, length unit.
 
     Returns:
         The `Surface`, as a sensor file describes it.
@@ -66,11 +65,11 @@ def drafted_surface(shape: str, numbers: Mapping[str, float | list[float]], base
 
 @dataclass(frozen=True)
 class RimCircle:
-    """The rim as an image shows it, by a camera on the axis of a round membrane: its radius and distance, and a focal length.
+    """The relation between distance and focal length given the image of a round rim, by a camera on its axis.
 
     Args:
         radius: radius of the rim, length unit.
-        pixels: its radius in the image, px.
+        pixels: radius of the rim in the image, px.
         model: "pinhole" | "fisheye".
 
     Example:
@@ -83,7 +82,7 @@ class RimCircle:
     model: str
 
     def distance(self, focal: float) -> float:
-        """The rim's distance before the camera, by the focal length (px; fisheye: px / rad); less than 0 behind a fisheye.
+        """Return the rim's distance from the camera for a focal length (px; fisheye: px / rad); negative behind a fisheye.
 
         Raises:
             MembraneError: the rim is more than 180 degrees from the axis of a fisheye.
@@ -99,12 +98,12 @@ class RimCircle:
         return round(self.radius * math.cos(angle) / math.sin(angle), DECIMALS)
 
     def focal(self, distance: float) -> float:
-        """The focal length, by the rim's distance."""
+        """Return the focal length for a distance of the rim."""
         return self.pixels / (self.radius / distance if self.model == "pinhole" else math.atan2(self.radius, distance))
 
 
 def focal_of_view(model: str, width: int, degrees: float) -> float:
-    """The focal length in px of a lens with the given field of view, in degrees, across the image's width.
+    """Return the focal length, px, of a lens with the given field of view, degrees, across the image's width.
 
     Example:
         >>> focal_of_view("pinhole", 640, 90.0).__round__(6), focal_of_view("fisheye", 628, 180.0).__round__(2)
@@ -121,11 +120,11 @@ def focal_of_view(model: str, width: int, degrees: float) -> float:
 
 
 def overpressure(membrane: Membrane, material: Material, unit: str) -> float:
-    """The pressure over its surroundings that holds a membrane at rest, hPa: of a sphere of radius r, `2 T / r`, T its tension.
+    """Return the overpressure that balances a membrane at rest, hPa; for a sphere of radius r and tension T it is `2 T / r`.
 
     Args:
         membrane: the rest surface.
-        material: its prestretch, shear modulus and thickness at rest.
+        material: the material, with prestretch, shear modulus and thickness at rest.
         unit: unit of length.
 
     Example:
@@ -146,21 +145,21 @@ def balanced(
     shear_modulus: float | None = None,
     thickness: float | None = None,
 ) -> tuple[Material, list[str]]:
-    """A neo-Hookean material in balance with the overpressure: prestretch or modulus from it, where one of them is left out.
+    """Return a neo-Hookean material in equilibrium with the overpressure; a missing prestretch or modulus is derived from it.
 
     Args:
         membrane: the rest surface.
         unit: unit of length.
-        stated: the overpressure measured, hPa.
+        stated: measured overpressure, hPa.
         prestretch: prestretch of the membrane at rest.
-        shear_modulus: N per length unit squared.
-        thickness: at rest, already stretched, length unit.
+        shear_modulus: shear modulus, N per length unit squared.
+        thickness: thickness at rest, after prestretching, length unit.
 
     Returns:
-        The `Material`, and what was derived, assumed or contradicts, in sentences.
+        The `Material`, and sentences on derived, assumed or contradictory values.
 
     Raises:
-        MembraneError: an overpressure from which nothing follows, or that no prestretch up to `LARGEST_STRETCH` holds.
+        MembraneError: nothing can be derived from the overpressure, or no prestretch up to `LARGEST_STRETCH` balances it.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -209,10 +208,10 @@ def balanced(
 
 
 def pressure_in_hectopascal(text: str) -> float:
-    """A pressure with its unit, such as 20hPa, 2 kPa, 0.3psi.
+    """Parse a pressure with its unit, such as `20hPa`, `2 kPa` or `0.3psi`, and return it in hPa.
 
     Raises:
-        ValueError: no number, or no unit that is known.
+        ValueError: the text has no number or no known unit.
 
     Example:
         >>> pressure_in_hectopascal("2kPa")
@@ -226,14 +225,14 @@ def pressure_in_hectopascal(text: str) -> float:
 
 
 def drafted_dots(surface: Surface, pitch: float | None = None) -> tuple[np.ndarray, list[str]]:
-    """A square pattern of alternating large and small dots, to be made on the membrane.
+    """Return a square pattern of alternating large and small dots on a drafted membrane.
 
     Args:
-        surface: one that `drafted_surface` gives.
-        pitch: their distance along the membrane, length unit; None: `PITCHES` across the square root of its area.
+        surface: a drafted rest surface.
+        pitch: pitch along the membrane, length unit; None: the square root of its area over `PITCHES`.
 
     Returns:
-        Positions `[D, 3]` in the camera's frame, and sizes.
+        Positions of the dots in the camera's frame, `[D, 3]`, and their sizes.
 
     Raises:
         MembraneError: the pitch gives fewer than `FEWEST_MARKERS` dots, or more than `MOST_DOTS`.

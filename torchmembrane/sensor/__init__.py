@@ -1,1 +1,1 @@
-"""A sensor: what is known of it, its file, and the mechanics that follow from it."""
+"""The sensor: its description, its file, and the mechanics of its membrane."""

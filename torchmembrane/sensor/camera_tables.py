@@ -1,4 +1,4 @@
-"""`[camera]` of a sensor's file, or `[[camera]]` of several views: reading and writing."""
+"""Read and write `[camera]` of a sensor's file, or `[[camera]]` for several views."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,17 +20,17 @@ from .views import SIDES, View
 KEYS = ("model", "image_size", "focal", "centre", "distortion", "crop", "binning", "bits", "ports", "medium")
 OF_VIEWS = ("name", "pose", "region", "side", "rest_image")
 FIRST = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
-"""The first view's pose, which it may leave out."""
+"""Pose of the first view, which the file may leave out."""
 
 
 def read_cameras(file: Table) -> tuple[Camera, list[View]]:
-    """The first camera, and the views where the file has several.
+    """Read the first camera, and all views if the file has several.
 
     Args:
-        file: the whole sensor file.
+        file: the top-level table of the sensor file.
 
     Raises:
-        MembraneError: names file, key, value, what was expected and the remedy.
+        MembraneError: a value is invalid; the message names file, key, value, what was expected and the remedy.
     """
     if not isinstance(file.values.get("camera"), list):
         return _read_camera(file.table("camera")), []
@@ -42,10 +42,10 @@ def read_cameras(file: Table) -> tuple[Camera, list[View]]:
 
 
 def with_rest_images(file: Table, views: list[View], markers: Markers) -> tuple[list[View], Markers]:
-    """The views with their regions of the shared rest image, and the markers with the first view's.
+    """Return the views with their regions of the shared rest image, and the markers with the first view's rest image.
 
     Raises:
-        MembraneError: views with images of their own have theirs in `[[camera]]`.
+        MembraneError: `[markers]` has a rest image although the views have images of their own.
     """
     shared = markers.rest_image
     if shared is None:
@@ -57,10 +57,10 @@ def with_rest_images(file: Table, views: list[View], markers: Markers) -> tuple[
 
 
 def refuse_folded(file: Table, camera: Camera, views: Sequence[View], membrane: Membrane) -> None:
-    """Refuse a lens that folds within its image.
+    """Raise an error if a lens model folds within its image, so that two rays share a pixel.
 
     Raises:
-        MembraneError: names file, table and value.
+        MembraneError: a lens folds; the message names file, table and value.
     """
     if not views:
         with file.table("camera").naming("distortion"):
@@ -71,7 +71,7 @@ def refuse_folded(file: Table, camera: Camera, views: Sequence[View], membrane: 
 
 
 def camera_table(camera: Camera) -> dict[str, Any]:
-    """A camera's numbers and words as keys of its table; a camera in a mode is that mode's."""
+    """Return a camera's values by the keys of its table; a cropped or binned camera is given as in that mode."""
     return {
         "model": camera.model,
         "image_size": list(camera.image_size),
@@ -83,20 +83,20 @@ def camera_table(camera: Camera) -> dict[str, Any]:
 
 
 def view_tables(views: Sequence[View]) -> list[dict[str, Any]]:
-    """The same of all views, with name, pose, region and side."""
+    """Return the camera tables of all views, each with name, pose, region and side."""
     return [view.described() | camera_table(view.camera) for view in views]
 
 
 def write_cameras(path: Path, camera: Camera, views: Sequence[View]) -> tuple[list[str], np.ndarray | None]:
-    """The lines of the cameras' tables; the views' rest images are written beside the file.
+    """Format the tables of all cameras, and write the views' rest images beside the sensor's file.
 
     Args:
         path: path of the sensor's file.
-        camera: the first one.
-        views: all, where there are several.
+        camera: the first camera.
+        views: all views if there are several, else empty.
 
     Returns:
-        The lines, and the rest image of `[markers]` that views share, if they do.
+        The lines, and the shared rest image for `[markers]` if the views are regions of one image.
     """
     if not views:
         return _lines("camera", camera_table(camera) | _calibrated(camera)), None
@@ -113,7 +113,7 @@ def write_cameras(path: Path, camera: Camera, views: Sequence[View]) -> tuple[li
 
 
 def shared_image(images: Sequence[np.ndarray | None], views: Sequence[View]) -> np.ndarray | None:
-    """The image whose regions are those of the views, dark beside them; None where views have images of their own."""
+    """Assemble the shared image from the views' regions, black elsewhere; None if the views have images of their own."""
     if views[0].region is None or views[0].camera.mode is None or any(image is None for image in images):
         return None
     width, height = views[0].camera.mode.image_size
@@ -170,7 +170,7 @@ def _read_camera(table: Table, others: Sequence[str] = ()) -> Camera:
 
 
 def _calibrated(camera: Camera) -> dict[str, list[float]]:
-    """The calibration and the mode of a camera in one, as keys of its file; none where its values are no longer the mode's."""
+    """Return calibration and mode (crop, binning) of a camera by key; empty if its values no longer follow from the mode."""
     mode, found = camera.mode, (camera.focal.tolist(), camera.centre.tolist())
     if mode is None or found != (list(mode.binned_focal), list(mode.binned_centre)):
         return {}
@@ -178,7 +178,7 @@ def _calibrated(camera: Camera) -> dict[str, list[float]]:
 
 
 def _lines(name: str, table: dict[str, Any], repeated: bool = False) -> list[str]:
-    """A camera's table with its ports and medium as lines of TOML."""
+    """Format a camera's table, with its ports and medium, as lines of TOML."""
     ports, medium = table.pop("ports"), table.pop("medium")
     lines = toml_lines(name, table, repeated)
     for port in ports:

@@ -1,4 +1,4 @@
-"""The files of a sensor on disk: its `.toml`, and the arrays, dots and images beside it."""
+"""List the files of a sensor: its `.toml`, and the arrays, dots and images beside it."""
 
 import glob
 from pathlib import Path
@@ -8,13 +8,13 @@ from .table import Table
 
 
 def files_of(path: Path) -> list[Path]:
-    """A sensor's file, and those beside it that it names.
+    """Return a sensor's file and the files that it names.
 
     Args:
         path: path of the `.toml` file.
 
     Raises:
-        MembraneError: it cannot be read as TOML.
+        MembraneError: the file cannot be read as TOML.
 
     Example:
         >>> [file.name for file in files_of(Path("examples/sensor.toml"))]
@@ -24,7 +24,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def companions_of(path: Path) -> list[Path]:
-    """The sensor's file, and all files that `write_sensor` may write beside it.
+    """Return the sensor's file and all files that `write_sensor` may write beside it.
 
     Example:
         >>> [file.name for file in companions_of(Path("a.toml"))]

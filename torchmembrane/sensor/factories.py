@@ -1,4 +1,4 @@
-"""From a sensor to the mechanics of its membrane: elastic energy, cavity."""
+"""Make the mechanics of a sensor's membrane: its elastic energy and its cavity."""
 
 from typing import NamedTuple
 
@@ -11,11 +11,11 @@ from .sensor import Sensor
 
 
 class CavityFilling(NamedTuple):
-    """What a cavity is filled with, as estimators and the simulator take it.
+    """The filling of a cavity, in the form that estimators and the simulator take.
 
     Attributes:
         filling: "liquid" | "gas" | "open".
-        gas: absolute pressure at rest (force / length^2) and volume (length^3) of a gas, else None.
+        gas: absolute pressure (force / length^2) and volume (length^3) of a gas at rest; None for other fillings.
     """
 
     filling: str
@@ -30,17 +30,17 @@ def elastic_energy(
     prestretch: float | None = None,
     modulus: float | None = None,
 ) -> ElasticEnergy:
-    """The elastic energy of a sensor's material on a membrane of any grid.
+    """Return the elastic energy of a sensor's material on a membrane of any grid.
 
     Args:
-        sensor: gives the material.
+        sensor: the sensor whose material is used.
         membrane: the rest surface, such as `sensor.membrane`.
-        model: another one than the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: another one than the sensor's.
-        modulus: another shear modulus x thickness than the sensor's, force / length.
+        model: material model, "harmonic" | "neo_hookean" | "mooney_rivlin"; default: the sensor's.
+        prestretch: prestretch; default: the sensor's.
+        modulus: shear modulus x thickness, force / length; default: the sensor's.
 
     Returns:
-        The `ElasticEnergy`; of an inflated surface one whose prestretch and modulus belong to the sheet.
+        The `ElasticEnergy`; for an inflated surface, prestretch and modulus are those of the sheet before inflation.
 
     Example:
         >>> from torchmembrane.sensor.sensor import Sensor
@@ -61,17 +61,18 @@ def elastic_energy(
 
 
 def cavity_filling(sensor: Sensor, membrane: Membrane, *, warn: bool = False) -> CavityFilling:
-    """What fills a sensor's cavity, in the sensor's units.
+    """Return the filling of a sensor's cavity, in the sensor's units.
 
-    A gas of a sensor without modulus and thickness acts as a liquid: its pressure cannot be compared with relative ones.
+    Without shear modulus and thickness, a gas is treated as a liquid, because its pressure cannot be compared with relative
+    pressures.
 
     Args:
-        sensor: gives filling, pressure and volume.
-        membrane: gives a gas' volume where the sensor does not: that between its rim and its rest surface.
-        warn: say so in a warning where a gas acts as a liquid; attributed to the caller of the function that calls this.
+        sensor: the sensor with filling, pressure and volume.
+        membrane: the membrane; the volume between its rim and its rest surface is used if the sensor has no volume.
+        warn: whether to warn if a gas is treated as a liquid; the warning points to the caller of the calling function.
 
     Returns:
-        `CavityFilling`; `*` of it are the arguments `filling, gas` of estimators and presses.
+        The `CavityFilling`, which unpacks into the arguments `filling, gas` of estimators and presses.
 
     Example:
         >>> from torchmembrane.sensor.sensor import Sensor

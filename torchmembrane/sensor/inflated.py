@@ -1,4 +1,4 @@
-"""The rest surface of shape "inflated": a sheet on a closed rim, blown up; solved from the numbers of the sensor's file."""
+"""The rest surface of shape "inflated": a sheet on a closed rim, inflated; computed from the values of the sensor's file."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from .units import hectopascal
 
 SHAPE = "inflated"
 FORMULAS = ("rectangle", "ellipse")
-"""Outlines by numbers; any other is a file."""
+"""Outlines that numbers describe; any other outline is the name of a file."""
 KEYS = ("outline", "size", "corner", "base_z", "height", "overpressure")
 MOST_PRESSURE = 1e6  # hPa
 MOST_RIM_BYTES = 2**20
@@ -31,20 +31,21 @@ COORDINATE = Limit(FARTHEST, "a coordinate", "the length unit")
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class InflatedSurface(Surface):
-    """A rest surface that is the equilibrium of a sheet, stretched on a rim and blown up; `Surface` of shape "inflated".
+    """A rest surface of shape "inflated": the equilibrium of a sheet that is stretched over a rim and inflated.
 
-    The prestretch, shear modulus and thickness of its material are the sheet's as it is stretched in its rim, without pressure.
+    Prestretch, shear modulus and thickness of the material describe the sheet stretched over its rim, before inflation.
 
     Args:
         shape: "inflated".
-        values: `outline`, "rectangle", "ellipse" or points `[K, 2]` or `[K, 3]` once around; of the first two `size [a, b]` and
-            `corner`; `base_z` of the rim (of points with z added to theirs, default 0); and either `height` of the highest
-            point above the rim's plane or `overpressure`, hPa.
+        values: the following values by key. `outline`: "rectangle", "ellipse", or points `[K, 2]` or `[K, 3]` once around the
+            rim. `size` `[a, b]`, for rectangle and ellipse. `corner`: radius of the rectangle's corners. `base_z`: z of the
+            rim, added to the z of points (default 0 for points). Either `height`, of the highest point above the rim's plane,
+            or `overpressure`, hPa.
         material: material of the sheet.
         length_unit: unit of all lengths.
 
     Raises:
-        MembraneError: a key too many or missing; an overpressure without a modulus.
+        MembraneError: a key is missing or unknown, or an overpressure is given without a modulus.
 
     Example:
         >>> rubber = Material("neo_hookean", prestretch=1.1, shear_modulus=0.4, thickness=0.3)
@@ -76,7 +77,7 @@ class InflatedSurface(Surface):
 
     @property
     def rim(self) -> np.ndarray:
-        """Points of the rim once around, `[K, 3]`, camera's frame."""
+        """Points once around the rim, `[K, 3]`, camera's frame."""
         v = self.values
         if not isinstance(v["outline"], str):
             points = np.asarray(v["outline"], float)
@@ -89,7 +90,7 @@ class InflatedSurface(Surface):
 
     @property
     def formed(self) -> FormedSurface:
-        """The equilibrium; solved once."""
+        """The equilibrium shape; `formed_surface` caches its solution."""
         m, v = self.material, self.values
         sheet = SheetMaterial(m.model, float(m.prestretch), float(m.c2_ratio or 0.0))
         if "height" in v:
@@ -97,35 +98,35 @@ class InflatedSurface(Surface):
         return formed_surface(self.rim, sheet, pressure=v["overpressure"] * hectopascal(self.length_unit) / m.modulus)
 
     def membrane(self, grid: tuple[int, int]) -> Membrane:
-        """The rest surface on a solver grid; see `Surface.membrane`."""
+        """Return the rest surface on a solver grid; see `Surface.membrane`."""
         return Membrane(self.formed.resampled_to(grid)[0])
 
     def sheet(self, grid: tuple[int, int]) -> Tensor:
-        """Where the vertices of a solver grid were without pressure, `[V, 3]`."""
+        """Return the positions of a solver grid's vertices on the sheet before inflation, `[V, 3]`."""
         return torch.from_numpy(self.formed.resampled_to(grid)[1].reshape(-1, 3).copy())
 
     def of_height(self, height: float) -> "InflatedSurface":
-        """The same sheet and rim, blown up to another height."""
+        """Return the same sheet and rim, inflated to another height."""
         values = {key: value for key, value in self.values.items() if key != "overpressure"} | {"height": height}
         return replace(self, values=values)
 
     def made_of(self, material: Material, length_unit: str) -> "InflatedSurface":
-        """The same rim and height, or overpressure, with another sheet."""
+        """Return the surface of the same rim and height (or overpressure) with a sheet of another material."""
         if (material, length_unit) == (self.material, self.length_unit):
             return self
         return replace(self, material=material, length_unit=length_unit)
 
 
 def read_inflated(table: Table, material: Material, length_unit: str) -> InflatedSurface:
-    """The surface that `[membrane]` of a sensor's file describes.
+    """Read an inflated surface from `[membrane]` of a sensor's file.
 
     Args:
-        table: `[membrane]`.
-        material: material of `[material]`.
-        length_unit: unit of the file.
+        table: the table `[membrane]`.
+        material: the material read from `[material]`.
+        length_unit: unit of lengths in the file.
 
     Raises:
-        MembraneError: names file, key, value, what was expected and the remedy.
+        MembraneError: a value is invalid; the message names file, key, value, what was expected and the remedy.
     """
     table.allow(("shape", "grid", *KEYS), f"for shape {SHAPE}")
     outline = table.text("outline")
@@ -137,21 +138,21 @@ def read_inflated(table: Table, material: Material, length_unit: str) -> Inflate
     values |= {key: table.number(key) for key in KEYS[2:] if key in table}
     with table.naming():
         surface = InflatedSurface(SHAPE, values, material, length_unit)
-        surface.formed  # noqa: B018  # refused here, where the table is named
+        surface.formed  # noqa: B018  # solved here, so that an error names the table
     return surface
 
 
 def read_rim(path: Path) -> np.ndarray:
-    """Points of a rim once around, `[K, 2]` or `[K, 3]`, from a table `x,y` or `x,y,z`.
+    """Read points once around a rim, `[K, 2]` or `[K, 3]`, from a CSV table with columns `x,y` or `x,y,z`.
 
     Raises:
-        MembraneError: another table, or a number that is none.
+        MembraneError: the table has other columns, or a value is not a number.
     """
     form, rows = read_table(path, RIM_TABLE, MOST_RIM_BYTES)
     return np.array([row.numbers(form, COORDINATE) for row in rows])
 
 
 def rim_lines(outline: np.ndarray) -> str:
-    """The table that `read_rim` reads."""
+    """Format points of a rim as the CSV table that `read_rim` reads."""
     head = ",".join("xyz"[: outline.shape[1]])
     return "\n".join([head, *(",".join(map(repr, row)) for row in np.asarray(outline, float).tolist())]) + "\n"

@@ -1,4 +1,4 @@
-"""Checks of markers against the rest surface that they are on."""
+"""Check markers against the rest surface on which they lie."""
 
 from collections.abc import Sequence
 
@@ -9,21 +9,21 @@ from ..errors import MembraneError, expect
 from ..surface.membrane import Membrane
 from .parts import Markers
 
-OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
-LEAST_APART = 1e-3  # of two dots, in the surface's size
-TALLEST = 0.5  # largest height of a marker, in the surface's size
+OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, over the surface's size
+LEAST_APART = 1e-3  # smallest distance between two dots, over the surface's size
+TALLEST = 0.5  # largest height of a marker, over the surface's size
 
 
 def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:
-    """Refuse the first dot that is not near the rest surface.
+    """Raise an error for the first dot that is not near the rest surface.
 
     Args:
         membrane: the rest surface.
-        positions: `[D, 3]`.
-        names: names of the D dots, as the message begins.
+        positions: positions of the dots, `[D, 3]`, length unit.
+        names: names of the D dots, for the message.
 
     Raises:
-        MembraneError: with its name, position, distance and what was expected.
+        MembraneError: a dot is off the surface; the message has its name, position, distance and the limit.
     """
     distance = membrane.closest_points(positions).distance
     limit = OFF_SURFACE * membrane.size
@@ -36,14 +36,14 @@ def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequenc
 
 
 def refuse_tall(membrane: Membrane, markers: Markers) -> None:
-    """Refuse markers that stand off the surface by more than a part of its size.
+    """Raise an error if markers stand off the surface by more than `TALLEST` of its size.
 
     Args:
         membrane: the rest surface.
-        markers: on it.
+        markers: its markers.
 
     Raises:
-        MembraneError: with the largest height, the limit, and the remedy.
+        MembraneError: a marker is too high; the message has the largest height, the limit and the remedy.
     """
     limit, largest = TALLEST * membrane.size, float(np.max(np.abs(markers.height), initial=0.0))
     expected = f"at most {limit:.4g}, {TALLEST:g} of the surface's size: give it in the length unit"
@@ -51,15 +51,15 @@ def refuse_tall(membrane: Membrane, markers: Markers) -> None:
 
 
 def refuse_coincident(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:
-    """Refuse the first dot that lies on another one.
+    """Raise an error for the first dot that coincides with another one.
 
     Args:
         membrane: the rest surface.
-        positions: `[D, 3]`.
-        names: names of the D dots, as the message begins.
+        positions: positions of the dots, `[D, 3]`, length unit.
+        names: names of the D dots, for the message.
 
     Raises:
-        MembraneError: with the names and positions of both, and what was expected.
+        MembraneError: two dots coincide; the message has their names and positions and the limit.
     """
     limit = LEAST_APART * membrane.size
     pairs = cKDTree(positions).query_pairs(limit, output_type="ndarray")

@@ -1,6 +1,6 @@
-"""What a sensor is made of: material, cavity, markers and rest surface as plain values, checked where they are made.
+"""The parts of a sensor: material, cavity, markers and rest surface as plain values, checked at construction.
 
-Lengths are in the sensor's unit, in the camera's frame. Pressures are in hPa, as in the file.
+Lengths are in the sensor's unit, positions in the camera's frame, and pressures in hPa, as in the file.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
 POSITIVE = {"shear_modulus": (1e-12, 1e12), "thickness": (1e-6, 1e5), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e18)}
-"""Ranges of these quantities of a membrane in the file's units, for every length unit."""
+"""Lowest and highest allowed values, in the file's units; they are wide enough for every length unit."""
 FILLINGS = ("liquid", "gas", "open")
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 SHAPES_BY_NUMBERS = {
@@ -40,17 +40,17 @@ SHAPES_BY_ARRAYS = {"grid": ("vertices", "fixed"), "heightfield": ("x", "y", "z"
 @check_arguments
 @dataclass(frozen=True)
 class Material:
-    """The membrane's elastic energy, its prestretch, and its stiffness where known.
+    """The membrane's elastic energy, its prestretch, and its stiffness if known.
 
     Args:
         model: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: 1 or more, equal in both directions.
-        c2_ratio: C2 / C1, Mooney-Rivlin only.
-        shear_modulus: N per length unit squared; None: forces are relative.
-        thickness: length unit, at rest (already stretched); None: forces are relative.
+        prestretch: the equibiaxial prestretch, 1 or more.
+        c2_ratio: C2 / C1, for "mooney_rivlin" only.
+        shear_modulus: shear modulus, N per length unit squared; None: forces are relative.
+        thickness: thickness at rest, after prestretching, length unit; None: forces are relative.
 
     Raises:
-        MembraneError: names the value, what came and what was expected.
+        MembraneError: a value is invalid; the message names it and says what was expected.
 
     Example:
         >>> Material("neo_hookean", prestretch=1.25, shear_modulus=0.3, thickness=0.4).modulus
@@ -78,22 +78,23 @@ class Material:
 
     @property
     def modulus(self) -> float:
-        """Shear modulus times thickness, N per length unit; 1 where either is unknown."""
+        """Shear modulus times thickness, N per length unit; 1 if either is unknown."""
         return 1.0 if self.shear_modulus is None or self.thickness is None else self.shear_modulus * self.thickness
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Cavity:
-    """What presses from inside.
+    """The filling of the cavity behind the membrane.
 
     Args:
-        filling: "liquid" (volume kept) | "gas" (absolute pressure x volume kept) | "open" (pressure stays at rest).
-        pressure: pressure of a gas, absolute, at rest, hPa.
-        volume: volume of a gas, length unit cubed; None: between the rim and the rest surface.
+        filling: "liquid" (constant volume) | "gas" (constant product of absolute pressure and volume) | "open" (the pressure
+            stays as at rest).
+        pressure: absolute pressure of a gas at rest, hPa.
+        volume: volume of a gas at rest, length unit cubed; None: the volume between the rim and the rest surface.
 
     Raises:
-        MembraneError: names the value, what came and what was expected.
+        MembraneError: a value is invalid; the message names it and says what was expected.
 
     Example:
         >>> Cavity("gas", pressure=1013.0).volume is None
@@ -116,19 +117,19 @@ class Cavity:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """What the camera follows.
+    """The markers that the camera tracks.
 
     Args:
         kind: "dots" | "texture".
-        polarity: "dark" | "light", the marks against their ground.
-        positions: `[D, 3]` of the dots at rest, length unit, camera frame; None: found in the rest image.
-        sizes: D times "small" | "large"; None: all small.
-        rest_image: an array as `to_grey` takes it, kept as grey float32 `[height, width]`; or a path, which is read.
-        height: height of dots that stand off the inner side along the inward normal, as the tips of pins do, length unit: one
-            number for all, or `[D]`, one for each listed dot, whose position is then that of its foot on the surface.
+        polarity: "dark" | "light": markers that are darker or lighter than their background.
+        positions: positions of the D dots at rest, `[D, 3]`, length unit, camera's frame; None: found in the rest image.
+        sizes: list of D sizes, "small" | "large"; None: all are small.
+        rest_image: an array that `to_grey` accepts, or the path of an image; stored as grey float32 `[height, width]`.
+        height: height of dots that stand off the membrane's inner side along the inward normal, such as the tips of pins,
+            length unit: one number for all, or `[D]`, one for each listed dot. A dot's position is then its foot's.
 
     Raises:
-        MembraneError: names the value, what came and what was expected.
+        MembraneError: a value is invalid; the message names it and says what was expected.
 
     Example:
         >>> Markers("dots", positions=np.array([[0.0, 0.0, 24.0], [2.0, 0.0, 23.8]])).sizes
@@ -170,7 +171,7 @@ class Markers:
         self._set_height(len(positions))
 
     def _set_height(self, count: int) -> None:
-        """Keep one number for all where they have the same."""
+        """Check the heights of `count` listed dots, and store a single number if they are equal."""
         heights = np.asarray(self.height, dtype=np.float64)
         right = heights.shape in ((), (count,)) and bool(np.isfinite(heights).all())
         expect(right, "height", self.height, f"a finite number, or an array of {count}, one for each listed dot")
@@ -181,22 +182,22 @@ class Markers:
 
     @property
     def stand_off(self) -> bool:
-        """Whether any of the markers stands off the surface."""
+        """Whether any marker stands off the surface."""
         return bool(np.any(self.height))
 
     def heights(self, count: int) -> np.ndarray:
-        """Heights `[count]` of so many markers."""
+        """Return the heights of `count` markers, `[count]`."""
         return np.broadcast_to(np.asarray(self.height, dtype=np.float64), (count,))
 
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The rest surface as the file describes it, before it is brought on the solver grid.
+    """The rest surface as the file describes it, before it is resampled to the solver grid.
 
     Args:
         shape: "grid" | "spherical_cap" | "ellipsoid_cap" | "half_cylinder" | "heightfield".
-        values: the numbers or arrays that belong to it, by the file's keys.
+        values: the numbers or arrays that describe this shape, by the keys of the file.
 
     Example:
         >>> cap = Surface("spherical_cap", {"rim_radius": 12.0, "height": 9.0, "base_z": 15.0})
@@ -216,16 +217,16 @@ class Surface:
 
     @check_arguments
     def membrane(self, grid: tuple[int, int]) -> Membrane:
-        """The surface on a solver grid; what lies in arrays is interpolated unless it has that grid already.
+        """Return the surface on a solver grid; arrays are interpolated unless they already have that grid.
 
         Args:
-            grid: numbers of vertices along both directions.
+            grid: number of vertices in each direction.
 
         Returns:
             The `Membrane`.
 
         Raises:
-            MembraneError: the surface folds, or cannot be seen from the camera.
+            MembraneError: the surface folds, or the camera cannot see it.
         """
         if self.shape in SHAPES_BY_NUMBERS:
             made: Membrane = getattr(shapes, self.shape)(**self.values, grid=grid)
@@ -236,10 +237,10 @@ class Surface:
     @classmethod
     @check_arguments
     def from_membrane(cls, membrane: Membrane) -> "Surface":
-        """The surface that a membrane's own grid describes.
+        """Return the surface that a membrane's vertices describe.
 
         Args:
-            membrane: on any grid.
+            membrane: a membrane on any grid.
 
         Returns:
             A `Surface` of shape "grid".
@@ -251,16 +252,16 @@ class Surface:
     of = from_membrane  # its name before 0.2.0
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Those of the values that are arrays, which lie in a file of their own."""
+        """Return the values that are arrays; they are stored in a separate file."""
         return {key: value for key, value in self.values.items() if isinstance(value, np.ndarray)}
 
     def numbers(self) -> dict[str, Any]:
-        """Those of the values that stand in the sensor file itself."""
+        """Return the values that are stored in the sensor file itself."""
         return {key: value for key, value in self.values.items() if not isinstance(value, np.ndarray)}
 
 
 class SensorParts(NamedTuple):
-    """All parts of a sensor, as its file gives them and takes them.
+    """All parts of a sensor, as read from its file and written to it.
 
     Attributes:
         name: any text.
@@ -271,10 +272,10 @@ class SensorParts(NamedTuple):
         cavity: the `Cavity`.
         markers: the `Markers`.
         surface: the rest surface as the file describes it.
-        tool: the camera's pose in the tool's frame, where it is known.
-        record: serial and calibration.
-        range: in which its answers were shown right.
-        views: all, where there are several.
+        tool: the camera's pose in the tool's frame, if it is known.
+        record: serial number and calibration.
+        range: the validated working range.
+        views: all views if there are several, else empty.
     """
 
     name: str
@@ -292,14 +293,14 @@ class SensorParts(NamedTuple):
 
 
 def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:
-    """Refuse a rest image that is neither of the camera's size nor, where it is in a mode, of the calibrated one.
+    """Raise an error if a rest image has neither the camera's size nor, for a cropped or binned camera, the calibrated size.
 
     Args:
-        size: size of the image, width and height, px.
-        camera: the sensor's.
+        size: width and height of the image, px.
+        camera: the sensor's camera.
 
     Raises:
-        MembraneError: with both sizes, and the remedy.
+        MembraneError: the size is wrong; the message has both sizes and the remedy.
     """
     mode = camera.mode
     if size == camera.image_size or (mode is not None and size == mode.image_size):

@@ -1,4 +1,4 @@
-"""What is known of a sensor as one piece: its serial, and when and how it was calibrated."""
+"""The record of an individual sensor: its serial number, and when and how it was calibrated."""
 
 import json
 from collections.abc import Callable
@@ -9,14 +9,14 @@ from .table import Table
 
 
 class Record(NamedTuple):
-    """`[record]` of a sensor file. It says nothing of how images become surfaces, so it is no part of the fingerprint.
+    """`[record]` of a sensor file. It does not affect reconstructions, so it is not part of the fingerprint.
 
     Attributes:
-        serial: serial of the piece, any text.
-        calibrated: the day of the latest calibration.
-        images: that it was made from.
-        by: what made it.
-        uncertainty: standard deviation of forces by the calibration of the material, over the force; `force_deviation` has it.
+        serial: serial number of this unit, any text.
+        calibrated: date of the latest calibration.
+        images: number of images used for it.
+        by: the command that made it.
+        uncertainty: relative standard deviation of forces due to the material's calibration; `force_deviation` includes it.
 
     Example:
         >>> Record("A17", date(2026, 9, 27), 12, uncertainty=0.04).text
@@ -33,16 +33,16 @@ class Record(NamedTuple):
 
     @property
     def known(self) -> dict[str, Any]:
-        """What is known, by key."""
+        """The known values by key."""
         return {key: value for key, value in self._asdict().items() if value is not None}
 
     @property
     def text(self) -> str:
-        """What is known as JSON, as results and exported models carry it; empty where nothing is."""
+        """The known values as JSON, as stored in results and exported models; empty if nothing is known."""
         return json.dumps(self.known, default=str, ensure_ascii=False) if self.known else ""
 
     def said(self, today: date) -> list[str]:
-        """Lines that say what is known, with the age of the calibration.
+        """Format the record as lines of text, with the age of the calibration on the day `today`.
 
         Example:
             >>> Record("A17", date(2026, 9, 27), 12, "calibrate rest").said(date(2026, 11, 27))
@@ -61,10 +61,10 @@ class Record(NamedTuple):
 
 
 def read_record(table: Table) -> Record:
-    """The record that a table `[record]` holds; every key may be left out.
+    """Read the record from a table `[record]`; every key is optional.
 
     Raises:
-        MembraneError: another key, or a value that is none of its kind.
+        MembraneError: a key is unknown, or a value has the wrong type.
     """
     table.allow(Record._fields)
     kinds: dict[str, Callable[[str], Any]] = {"serial": table.text, "by": table.text, "calibrated": table.date}

@@ -34,27 +34,28 @@ from .working_range import GENERAL, WorkingRange
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """All that is known of one sensor; checked at construction.
+    """The complete description of one sensor, checked at construction.
 
     Args:
         name: any text.
         length_unit: "mm" | "cm" | "m" | "um" | "inch".
         camera: the calibrated `Camera`.
         membrane: the rest surface on the solver grid, in the camera's frame.
-        material: its elastic energy and stiffness.
-        cavity: what fills it.
-        markers: what the camera follows on it.
-        surface: how the file describes the rest surface (default: by the membrane's grid).
-        tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), where it is known.
-        record: serial and calibration of the piece, as `[record]` has them; no part of the fingerprint.
-        range: in which its answers were shown right, of `check --accuracy`; else the general one.
-        views: all `View`s of a sensor with several cameras or mirrors, the first one that of `camera` and the markers' rest
-            image; empty: the camera is the only one.
+        material: the membrane's elastic energy and stiffness.
+        cavity: the filling of the cavity behind the membrane.
+        markers: the markers that the camera tracks on the membrane.
+        surface: the rest surface as the file describes it; default: the membrane's vertices.
+        tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), if it is known.
+        record: serial number and calibration of this unit, as in `[record]`; not part of the fingerprint.
+        range: the working range that `check --accuracy` has validated; default: the general range.
+        views: all `View`s of a sensor with several cameras or mirrors; the first one has `camera` and the markers' rest image.
+            Empty if there is only one camera.
 
-    A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
+    If the camera is `in_mode`, a rest image of the calibrated size is cropped and binned accordingly.
 
     Raises:
-        MembraneError: a dot lies off the rest surface or on another one, or the rest image has another size than the camera's.
+        MembraneError: a dot lies off the rest surface or coincides with another dot, or the size of the rest image differs
+            from the camera's.
 
     Example:
         >>> sensor = Sensor.from_file("examples/sensor.toml")
@@ -94,10 +95,10 @@ class Sensor:
             refuse_views(self.views, self.markers.kind == "dots" and self.markers.positions is not None)
 
     def in_view(self, number: int) -> "Sensor":
-        """The sensor of one of the views alone, in that view's frame: its camera, and the membrane as it is seen from there.
+        """Return a sensor with a single view: that view's camera, and the membrane in that view's frame.
 
         Args:
-            number: number of the view, from 0; 0 of a sensor with one camera is the sensor itself.
+            number: number of the view, from 0. For a sensor with one camera, 0 returns the sensor itself.
 
         Raises:
             MembraneError: there is no such view.
@@ -123,10 +124,10 @@ class Sensor:
         )
 
     def with_camera(self, camera: Camera, number: int = 0) -> "Sensor":
-        """The sensor with another lens or other ports of its camera, or of that of a view.
+        """Return the sensor with another camera (lens and ports), for one of its views.
 
         Args:
-            camera: the camera, in the pixels of that view's images.
+            camera: the new camera, for the pixels of that view's images.
             number: number of the view, from 0.
 
         Example:
@@ -141,31 +142,31 @@ class Sensor:
         return replace(self, camera=views[0].camera, views=tuple(views))
 
     def refuse_views(self, owner: str) -> None:
-        """Refuse a sensor with several views where only one is taken.
+        """Raise an error if the sensor has several views, for functions that support one view only.
 
         Args:
-            owner: what takes it, as the message begins.
+            owner: name of the calling function, with which the message begins.
 
         Raises:
-            MembraneError: with the remedy.
+            MembraneError: the sensor has several views; the message says what to do.
         """
         expect(not self.views, f"{owner}: views", len(self.views), "one camera, as of sensor.in_view(0)")
 
     def refuse_heights(self, owner: str) -> None:
-        """Refuse a sensor whose markers stand off the surface where they must lie on it.
+        """Raise an error if markers stand off the surface, for functions that need them on the surface.
 
         Args:
-            owner: what needs them there, as the message begins.
+            owner: name of the calling function, with which the message begins.
 
         Raises:
-            MembraneError: with the remedy.
+            MembraneError: markers stand off the surface.
         """
         height, expected = self.markers.height, "0: markers must lie on the surface for this; a pin's height is not known to it"
         expect(not self.markers.stand_off, f"{owner}: height of the markers", height, expected)
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Width and height of its images, px. For several views it is the size of their common or largest image."""
+        """Width and height of the sensor's images, px; with several views, of their shared image or the largest one."""
         modes = [view.camera.mode for view in self.views if view.region is not None]
         if modes and modes[0] is not None:
             return modes[0].image_size
@@ -174,11 +175,11 @@ class Sensor:
 
     @property
     def views_apart(self) -> list[str]:
-        """Names of the views where each has images of its own; none of one view, or of regions of one image."""
+        """Names of the views that have images of their own; empty for one view, or if views are regions of one image."""
         return [view.name for view in self.views if view.region is None]
 
     def _solve_again(self, surface: InflatedSurface) -> None:
-        """The rest surface of the sensor's own material, where the given one was solved with another."""
+        """Solve the rest surface again with the sensor's material if the given one was solved with another material."""
         own = surface.made_of(self.material, self.length_unit)
         if own is surface:
             return
@@ -189,24 +190,24 @@ class Sensor:
 
     @property
     def force_unit(self) -> str:
-        """Either "N" or "relative": forces in units of shear modulus x thickness x length unit."""
+        """The unit of forces: "N", or "relative" for units of shear modulus x thickness x length unit."""
         known = self.material.shear_modulus is not None and self.material.thickness is not None
         return "N" if known else "relative"
 
     @property
     def gas_pressure(self) -> float | None:
-        """The cavity's absolute pressure at rest in N per length unit squared; 1 hPa = 100 N/m^2."""
+        """Absolute pressure of the gas at rest, N per length unit squared (1 hPa = 100 N/m^2); None if not given."""
         pressure = self.cavity.pressure
         return None if pressure is None else pressure * hectopascal(self.length_unit)
 
     @property
     def parts(self) -> SensorParts:
-        """The arguments that make this sensor."""
+        """The constructor arguments of this sensor."""
         return SensorParts(*(getattr(self, name) for name in SensorParts._fields))
 
     @cached_property
     def fingerprint(self) -> str:
-        """sha256 of the content: arrays and the rest image's grey values, wherever and in whatever order they were written."""
+        """SHA-256 of values, arrays and grey values of rest images; it does not depend on file names or the order of keys."""
         markers = self.markers
         arrays: dict[str, np.ndarray | None] = {**self.surface.arrays()}
         arrays |= {"positions": markers.positions, "rest_image": markers.rest_image}
@@ -223,7 +224,7 @@ class Sensor:
     @classmethod
     @check_arguments
     def from_file(cls, path: str | Path) -> "Sensor":
-        """The sensor that a `sensor.toml` describes, with the files named in it (paths relative to it).
+        """Read a sensor from a `sensor.toml` and the files named in it (their paths are relative to it).
 
         Args:
             path: path of the `.toml` file.
@@ -232,7 +233,8 @@ class Sensor:
             The `Sensor`.
 
         Raises:
-            MembraneError: names file, key (or line), what came, what was expected and the remedy.
+            MembraneError: a file is missing or invalid; the message names the file, the key or line, the value found, the value
+                expected and the remedy.
 
         Example:
             >>> Sensor.from_file("examples/sensor.toml").markers.kind
@@ -246,10 +248,10 @@ class Sensor:
 
     @check_arguments
     def to_file(self, path: str | Path) -> Path:
-        """Write the sensor, its arrays beside it: `sensor_grid.npz`, `sensor_dots.csv`, `sensor_rest.png`.
+        """Write the sensor's file, and beside it its arrays: `sensor_grid.npz`, `sensor_dots.csv`, `sensor_rest.png`.
 
         Args:
-            path: a `.toml`, after which the arrays' files are named; or a folder, which gets `sensor.toml`.
+            path: path of a `.toml` file, after which the other files are named; or a folder, in which `sensor.toml` is written.
 
         Returns:
             The path of the `.toml` file.
@@ -266,7 +268,7 @@ class Sensor:
 
 
 def _in_mode(markers: Markers, rest_image: np.ndarray, camera: Camera) -> Markers:
-    """The markers with a rest image of the camera's size, cropped and binned if it is of the calibrated one."""
+    """Return the markers with a rest image of the camera's size; an image of the calibrated size is cropped and binned."""
     size = (rest_image.shape[1], rest_image.shape[0])
     refuse_other_size(size, camera)
     if size == camera.image_size or camera.mode is None:
@@ -279,7 +281,7 @@ def _same_surface(one: Membrane, other: Membrane) -> bool:
 
 
 def _as_numbers(value: object) -> object:
-    """Whole and other numbers alike, so that 12 and 12.0 have one fingerprint."""
+    """Convert all numbers to floats, so that 12 and 12.0 have the same fingerprint."""
     if isinstance(value, Mapping):
         return {key: _as_numbers(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

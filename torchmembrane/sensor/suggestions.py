@@ -1,4 +1,4 @@
-"""What people write for the words of a sensor file, and the word that is meant."""
+"""Suggestions for misspelt or synonymous words in sensor files and commands."""
 
 import difflib
 from collections.abc import Iterable
@@ -37,7 +37,7 @@ ALIASES = {
     "inch": ("in", "inches"),
     "focal": ("focal_length", "fx", "fy", "f"),
     "centre": ("center", "principal_point", "cx", "cy"),
-    # of the command
+    # options of the command
     "dome": ("half_sphere", "hemisphere", "sphere", "spherical"),
     "cap": ("spherical_cap", "spherical_segment"),
     "bubble": ("balloon", "pillow"),
@@ -53,7 +53,7 @@ ALIASES = {
     "camera": ("lens", "intrinsics"),
     "material": ("weight", "newtons", "stiffness", "modulus", "gauge", "force"),
 }
-"""What is written, by the word that is meant."""
+"""Synonyms that users may write, by the word that is meant."""
 HINTS = {
     "spherical_cap": "half a sphere has rim_radius = height",
     "pressure": "of a gas, absolute: the atmosphere's, about 1013 hPa, and the overpressure",
@@ -62,7 +62,7 @@ HINTS = {
 
 
 def did_you_mean(word: object, choices: Iterable[str], otherwise: str = "") -> str:
-    """The question whether a wrong word stands for one of the choices, with a hint; `otherwise` where none is near.
+    """Return a question that suggests the closest of the choices for a wrong word; `otherwise` if none is close.
 
     Example:
         >>> did_you_mean("half_sphere", ["grid", "spherical_cap"]), did_you_mean("neo-Hookean", ["neo_hookean"])

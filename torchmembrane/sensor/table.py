@@ -1,6 +1,6 @@
-"""Checked access to the tables of a TOML file, and the few kinds of lines needed to write one.
+"""Checked access to the tables of a TOML file, and a writer for such tables.
 
-Every message names the file, the table and key, the value that came and what was expected.
+Every message names the file, the table, the key, the value found and what was expected.
 """
 
 import glob
@@ -22,23 +22,23 @@ from ..files.system_files import is_of_system
 from .suggestions import did_you_mean
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000
-"""Largest sensor file, and longest line in it: the time to read TOML grows as the square of a line's length."""
+"""Largest file (bytes) and longest line (characters): parsing time grows as the square of a line's length."""
 MOST_FILES = 1000
-"""Largest number of files that a key may name."""
+"""Largest number of files that one key may name."""
 LARGEST = 1e300
-"""Whole number."""
+"""Largest whole number."""
 DEEPEST = 8
-"""Level of tables and lists within one another."""
+"""Deepest nesting of tables and lists."""
 EXPECTED = "a sensor file in TOML"
 
 
 class Table:
-    """One table of a TOML file: typed, finite values by key, or a `MembraneError` that says where and what.
+    """One table of a TOML file, whose methods return checked values by key or raise a `MembraneError`.
 
     Args:
-        path: the file.
-        name: name of the table, dotted; empty for the file itself.
-        values: by key.
+        path: path of the file.
+        name: dotted name of the table; empty for the top level of the file.
+        values: the table's values by key.
 
     Example:
         >>> table = Table(Path("sensor.toml"), "material", {"prestretch": "1.2"})
@@ -53,7 +53,7 @@ class Table:
 
     @classmethod
     def from_file(cls, path: Path) -> "Table":
-        """The table of a whole file."""
+        """Read a file and return its top-level table."""
         text = read_text(path, MOST_BYTES, EXPECTED)
         if (longest := max(map(len, text.split("\n")))) > LONGEST_LINE:
             raise MembraneError(f"{path}: a line of {longest} characters; expected {EXPECTED}, lines of at most {LONGEST_LINE}")
@@ -70,17 +70,17 @@ class Table:
         return key in self.values
 
     def where(self, key: str = "") -> str:
-        """File, table and key, as messages begin."""
+        """Return file, table and key as the beginning of a message."""
         key = key if key.isidentifier() else _said(key) if key else ""
         return " ".join(part for part in (f"{self.path}:", f"[{self.name}]" if self.name else "", key) if part)
 
     def refuse(self, key: str, expected: str) -> MembraneError:
-        """The error for a value that is not what was expected."""
+        """Return the error for a value that differs from what was expected."""
         return MembraneError(f"{self.where(key)} = {_said(self.values[key])}; expected {expected}")
 
     @contextmanager
     def naming(self, key: str = "") -> Iterator[None]:
-        """Put file, table and key before the message of whatever is refused inside, unless it begins with the file."""
+        """Prefix the messages of errors raised in this context with file, table and key, unless they begin with the file."""
         try:
             yield
         except MembraneError as error:
@@ -90,7 +90,7 @@ class Table:
             raise MembraneError(f"{self.where(key)}{shown}: {error}") from error
 
     def allow(self, keys: Iterable[str], owner: str = "here") -> None:
-        """Refuse keys other than these, suggesting the closest."""
+        """Raise an error for a key that is not among `keys`, and suggest the closest one."""
         keys = list(keys)
         for key in self.values:
             if key not in keys:
@@ -98,12 +98,12 @@ class Table:
                 raise MembraneError(f"{self.where(key)} is unknown {owner}; expected {', '.join(keys)}; {remedy}")
 
     def table(self, key: str) -> "Table":
-        """The table within this one."""
+        """Return the subtable of this name."""
         name = f"{self.name}.{key}" if self.name else key
         return Table(self.path, name, self._get(key, _is_table, f"a table [{name}]"))
 
     def tables(self, key: str) -> list["Table"]:
-        """The tables of a list of them, `[[key]]`; none if there are none."""
+        """Return the tables of an array of tables, `[[key]]`; an empty list if the key is missing."""
         if key not in self:
             return []
         name = f"{self.name}.{key}" if self.name else key
@@ -111,7 +111,7 @@ class Table:
         return [Table(self.path, f"{name}[{i}]", value) for i, value in enumerate(values)]
 
     def text(self, key: str, choices: Iterable[str] = ()) -> str:
-        """Text that is not empty; one of `choices` where they are given."""
+        """Return a non-empty text, which must be one of `choices` if any are given."""
         choices = tuple(choices)
         meant = did_you_mean(self.values.get(key), choices)
         expected = (" or ".join(map(_shown, choices)) or "text in quotes") + (meant and f": {meant}")
@@ -123,29 +123,29 @@ class Table:
         return value
 
     def number(self, key: str) -> float:
-        """A finite number."""
+        """Return a finite number."""
         return float(self._get(key, _finite, "a finite number"))
 
     def numbers(self, key: str, count: int | None = None) -> list[float]:
-        """A list of finite numbers, `count` of them where that is given."""
+        """Return a list of finite numbers, whose length must be `count` if that is given."""
         return [float(value) for value in self._list(key, count, _finite, "finite")]
 
     def date(self, key: str) -> date:
-        """A day, as TOML has it or in quotes."""
+        """Return a date, written as a TOML date or as text in quotes."""
         value = self._get(key, lambda value: _day(value) is not None, "a day as 2026-09-27")
         return _day(value) or value
 
     def whole_number(self, key: str) -> int:
-        """A whole number."""
+        """Return a whole number."""
         value: int = self._get(key, _whole, "a whole number")
         return value
 
     def whole_numbers(self, key: str, count: int) -> list[int]:
-        """A list of `count` whole numbers."""
+        """Return a list of `count` whole numbers."""
         return self._list(key, count, _whole, "whole")
 
     def whole_pair(self, key: str) -> list[int]:
-        """Two whole numbers; one stands for both."""
+        """Return two whole numbers; a single number is used for both."""
 
         def right(value: object) -> bool:
             return _whole(value) or _is_list(value, 2, _whole)
@@ -154,7 +154,7 @@ class Table:
         return value if isinstance(value, list) else [value, value]
 
     def rotation(self, key: str) -> list[Any]:
-        """The numbers of a rotation: three rows of three, or three of a rotation vector."""
+        """Return a rotation: a matrix as three rows of three numbers, or a rotation vector of three numbers."""
 
         def right(value: object) -> bool:
             return _is_list(value, 3, _finite) or _is_list(value, 3, lambda row: _is_list(row, 3, _finite))
@@ -163,7 +163,7 @@ class Table:
         return value
 
     def matrix(self, key: str, count: int) -> list[list[float]]:
-        """A square matrix of finite numbers, row by row."""
+        """Return a square matrix of finite numbers as a list of `count` rows."""
 
         def right(value: object) -> bool:
             return _is_list(value, count, lambda row: _is_list(row, count, _finite))
@@ -172,16 +172,16 @@ class Table:
         return value
 
     def file(self, key: str) -> Path:
-        """The path of the file that `key` names, in this file's folder or below."""
+        """Return the path of the file that `key` names; it must lie in this file's folder or below."""
         return self._named(key, [self.text(key)])[0]
 
     def files(self, key: str) -> list[Path]:
-        """The paths of the files that `key` names, in this file's folder or below: one, a list, or patterns with `*`."""
+        """Return the paths of the files that `key` names (a name, a list or patterns), in this file's folder or below."""
         names = self._get(key, _is_names, "a file, or a list of files, in quotes")
         return self._named(key, [names] if isinstance(names, str) else names)
 
     def named_files(self) -> list[Path]:
-        """The files there are of all names within this table and the ones below it."""
+        """Return the existing files that any text in this table or its subtables names."""
         names = [name for name in _texts(self.values) if lies_within(name)]
         patterns = [f"{glob.escape(str(self.path.parent))}/{name if '*' in name else glob.escape(name)}" for name in names]
         return [Path(match) for pattern in patterns for match in sorted(glob.glob(pattern)) if os.path.isfile(match)]
@@ -216,15 +216,15 @@ class Table:
 
 
 def toml_lines(name: str, values: Mapping[str, object], repeated: bool = False) -> list[str]:
-    """A table as lines of TOML.
+    """Format a table as lines of TOML.
 
     Args:
-        name: name of the table, dotted; empty for the file itself.
-        values: text, numbers and lists of numbers by key; keys that are None are left out.
-        repeated: one of a list of tables.
+        name: dotted name of the table; empty for the top level of the file.
+        values: texts, numbers and lists of numbers by key; keys whose value is None are left out.
+        repeated: whether the table is an element of an array of tables, `[[name]]`.
 
     Returns:
-        The lines, the table's head first.
+        The lines, the table's header first.
 
     Example:
         >>> toml_lines("cavity", {"filling": "gas", "pressure": np.float64(1013.0), "volume": None})
@@ -245,7 +245,7 @@ def _shown(value: object) -> str:
 
 
 def _plain(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """The content of a file; refused if it is nested too deeply or contains a whole number of more than 300 digits."""
+    """Return the content of a file; raise an error if it is nested too deeply or has an integer of more than 300 digits."""
     level: list[Any] = [values]
     for _ in range(DEEPEST + 1):
         if any(isinstance(value, int) and abs(value) > LARGEST for value in level):
@@ -262,12 +262,12 @@ def _too_deep(path: Path) -> str:
 
 
 def _said(value: object) -> str:
-    """A value as messages have it: on one line, and not too long."""
+    """Format a value for a message: on one line, shortened if it is long."""
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in shortened(_shown(value)))
 
 
 def _is_file(path: Path) -> bool:
-    """Whether there is one, or something else of that name, which reading it refuses."""
+    """Return whether something of that name exists; if it is not a file, reading it raises the error."""
     try:
         return path.exists()
     except OSError:
@@ -275,7 +275,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _texts(value: object) -> Iterator[str]:
-    """All text within tables and lists."""
+    """Yield all texts in nested tables and lists."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):
@@ -288,7 +288,7 @@ def _finite(value: object) -> bool:
 
 
 def _day(value: object) -> date | None:
-    """The day that a value is, if it is one."""
+    """Convert a value to a date; return None if it is not one."""
     try:
         return date.fromisoformat(str(value)) if isinstance(value, str | date) else None
     except ValueError:

@@ -1,4 +1,4 @@
-"""Reading and writing `sensor.toml` and the arrays named in it."""
+"""Read and write `sensor.toml` and the files of arrays that it names."""
 
 import io
 import math
@@ -37,10 +37,10 @@ from .units import METRE
 from .working_range import GENERAL, WorkingRange, range_file
 
 FORMAT = 1
-COARSEST, FINEST = 25, 33  # solver grids chosen where the file names none
-FEWEST_LINES, MOST_LINES = 5, 65  # of a solver grid: beyond, a frame takes more than 2 GB
+COARSEST, FINEST = 25, 33  # default solver grids, vertices per side
+FEWEST_LINES, MOST_LINES = 5, 65  # of a solver grid, per side; with more lines a frame takes more than 2 GB
 MOST_VERTICES = 2**18
-"""Largest number of vertices of a rest surface in a file of arrays."""
+"""Largest number of vertices of a rest surface that is stored in a file of arrays."""
 MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
 SIZES = ("small", "large")
 DOTS_HEADER = ("x", "y", "z", "size")
@@ -50,17 +50,18 @@ DOTS = Columns([DOTS_HEADER], "dot", HEIGHT, most=MOST_DOTS)
 
 
 def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
-    """The parts of the sensor that a `sensor.toml` describes; `Sensor.from_file` puts them together.
+    """Read the parts of the sensor that a `sensor.toml` describes; `Sensor.from_file` makes a sensor of them.
 
     Args:
-        path: path of the `.toml` file; the files named in it are relative to its folder.
-        undotted: whether it is a design that may have no dots yet; one in the middle then stands for those to come.
+        path: path of the `.toml` file; paths in it are relative to its folder.
+        undotted: whether the file may be a design without dots; one dot in the middle of the surface is then a placeholder.
 
     Returns:
-        `SensorParts`.
+        The `SensorParts`.
 
     Raises:
-        MembraneError: names file, key (or line), what came, what was expected and the remedy.
+        MembraneError: a file is missing or invalid; the message names the file, the key or line, the value found, the value
+            expected and the remedy.
 
     Example:
         >>> parts = read_sensor(Path("examples/sensor.toml"))
@@ -98,14 +99,14 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
 
 
 def write_sensor(parts: SensorParts, path: Path) -> Path:
-    """Write a sensor's file, its arrays beside it; `Sensor.to_file` calls this.
+    """Write a sensor's file, and its arrays beside it; `Sensor.to_file` calls this function.
 
     Args:
-        parts: what is written.
+        parts: the parts of the sensor.
         path: path of the `.toml` file; the other files are named after it.
 
     Returns:
-        The path.
+        The path of the `.toml` file.
     """
     make_folder(path.parent)
     tables, surface, markers = tables_of(parts), parts.surface, parts.markers
@@ -131,7 +132,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
 
 
 def tables_of(parts: SensorParts) -> dict[str, Any]:
-    """A sensor's numbers and words, without arrays, as the tables and keys of its file; a camera in a mode is that mode's."""
+    """Return the tables of a sensor's file, without its arrays; a cropped or binned camera is given as in that mode."""
     camera, material, cavity, markers = parts.camera, parts.material, parts.cavity, parts.markers
     tables: dict[str, Any] = {
         "": {"format": FORMAT, "name": parts.name, "length_unit": parts.length_unit},
@@ -148,15 +149,16 @@ def tables_of(parts: SensorParts) -> dict[str, Any]:
 
 
 def default_grid(markers: Markers) -> tuple[int, int]:
-    """The solver grid where the file names none: some 2.8 times as fine as the dots listed, 25 or 33; 25 for texture.
+    """Return the default solver grid, 25 or 33 lines per side: about 2.8 times as fine as the listed dots; 25 for texture.
 
-    Of 29 lines the coarsest grid, 8, finds the basin of a deep press less surely than 7 of 25 and 9 of 33.
+    29 lines are not offered: their coarsest multigrid level has 8 lines and converges less reliably for deep presses than the
+    7 of 25 lines or the 9 of 33.
 
     Args:
-        markers: listed dots, dots still to be found in the rest image (33), or texture.
+        markers: listed dots, dots that are still to be found in the rest image (33 lines), or texture.
 
     Returns:
-        Numbers of vertices along both directions.
+        Number of vertices in each direction.
 
     Example:
         >>> default_grid(Markers("dots", positions=np.zeros((100, 3))))
@@ -194,7 +196,7 @@ def _read_cavity(table: Table) -> Cavity:
 
 
 def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
-    """The markers, and of each listed dot where it stands: file and line."""
+    """Return the markers, and for each listed dot the file and line that defines it."""
     table.allow(("kind", "file", "rest_image", "polarity", HEIGHT))
     kind = table.text("kind", ("dots", "texture"))
     polarity = table.text("polarity", ("dark", "light")) if kind == "dots" or "polarity" in table else "dark"
@@ -210,7 +212,7 @@ def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
     if heights is not None and HEIGHT in table:
         raise table.refuse(HEIGHT, f"none, as {dots} has a column of that name: remove one of them")
     with table.naming("rest_image"):
-        for path in images[:1]:  # the others are of the same size, or refused
+        for path in images[:1]:  # `mean_image` refuses images of another size
             refuse_other_size(image_size(path), camera)
         image = mean_image(images, camera.bits) if images else None
         return Markers(kind, polarity, positions, sizes, image, height if heights is None else heights), lines
@@ -222,7 +224,7 @@ def _dots_to_come(table: Table) -> Markers:
 
 
 def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str], np.ndarray | None]:
-    """Positions `[D, 3]`, sizes, where each dot stands, and heights `[D]` if there is a column of them."""
+    """Return positions `[D, 3]`, sizes, the file and line of each dot, and heights `[D]` if the table has that column."""
     rows = read_table(path, DOTS, MOST_DOTS_BYTES).rows
     positions = np.array([row.numbers("xyz", COORDINATE) for row in rows])
     heights = np.array([_read_height(row) for row in rows]) if HEIGHT in rows[0].places else None
@@ -237,7 +239,7 @@ def _read_height(row: Row) -> float:
 
 
 def _write_dots(path: Path, markers: Markers) -> None:
-    assert markers.positions is not None and markers.sizes is not None  # or there is no file of dots
+    assert markers.positions is not None and markers.sizes is not None  # `write_sensor` calls this only for listed dots
     rows = [[*map(repr, position), size] for position, size in zip(markers.positions.tolist(), markers.sizes, strict=True)]
     header: tuple[str, ...] = DOTS_HEADER
     if not isinstance(markers.height, float):

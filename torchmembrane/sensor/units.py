@@ -1,11 +1,11 @@
-"""Units of length, and what follows from them."""
+"""Units of length, and conversions of length and pressure."""
 
 METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "um": 1e6, "inch": 1 / 0.0254}
-"""One metre in the length unit."""
+"""One metre, in each length unit."""
 
 
 def millimetre(unit: str) -> float:
-    """One millimetre in a length unit.
+    """Return one millimetre in a length unit.
 
     Args:
         unit: one of `METRE`.
@@ -18,7 +18,7 @@ def millimetre(unit: str) -> float:
 
 
 def hectopascal(unit: str) -> float:
-    """One hPa, which is 100 N/m^2, in N per length unit squared.
+    """Return one hPa (100 N/m^2) in N per length unit squared.
 
     Args:
         unit: unit of length, one of `METRE`.

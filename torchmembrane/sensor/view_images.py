@@ -1,4 +1,4 @@
-"""Images of several views, each of which has its own, as one grey batch."""
+"""Combine the images of several views, each of which has its own, into one grey batch."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,26 +16,28 @@ from .views import View
 
 
 class MomentImages(NamedTuple):
-    """A frame's images of all views, `grey [1, W, height, width]`, and of the views that lack theirs why, by name."""
+    """The images of all W views of one frame, `grey` `[1, W, height, width]`, and the reason for each missing one, by view."""
 
     grey: Tensor
     lacking: dict[str, str]
 
 
 def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Tensor) -> Tensor:
-    """Grey images `[B, W, height, width]` in 0..1; the image of a smaller view is dark beyond its own size, and that
-    of a view without an image is NaN, so that the view is left out.
+    """Combine the views' images into one grey batch `[B, W, height, width]` in 0..1.
+
+    Images smaller than the largest are padded with black. The image of a view without an image is NaN, so that the view is
+    ignored.
 
     Args:
-        images: images of W views, those of the first view first: a list of W batches, each as `to_grayscale_batch` takes them,
-            None of a view without; or stacked, `[W, height, width]` or `[B, W, height, width]`, colour with its three channels
-            last.
+        images: images of the W views in the order of `views`: a list of W batches, each as `to_grayscale_batch` takes them, or
+            None for a view without images; or stacked, `[W, height, width]` or `[B, W, height, width]`, for colour with the
+            three channels last.
         views: views of the sensor.
         channels: order of the channels of colour images.
-        like: a tensor of the precision and device.
+        like: a tensor of the wanted precision and device.
 
     Raises:
-        MembraneError: another number of views, or of frames in one of them, or no view with images.
+        MembraneError: the number of views is wrong, the views have different numbers of frames, or none has images.
     """
     count = len(views)
     if not isinstance(images, list | tuple):
@@ -48,7 +50,7 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
             )
             raise MembraneError(f"images {list(stacked.shape)}; expected {expected}")
         images = stacked.unbind(axis)
-        if not has_colours:  # a stack may be as large as the largest view
+        if not has_colours:  # smaller views may be padded in the stack
             sizes = [view.camera.image_size for view in views]
             images = [batch[..., :height, :width] for batch, (width, height) in zip(images, sizes, strict=True)]
     if len(images) != count:
@@ -68,15 +70,15 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
 
 
 def read_views(path: Path, views: Sequence[View], like: Tensor) -> MomentImages:
-    """A frame's images of all views, as of `grey_views`.
+    """Read the images of all views of one frame; see `grey_views`.
 
     Args:
-        path: path of the first view's image, as of `view_files`.
+        path: path of the first view's image, named as for `view_files`.
         views: views of the sensor.
-        like: a tensor of the precision and device.
+        like: a tensor of the wanted precision and device.
 
     Raises:
-        MembraneError: the file is not named after the first view, or no view's can be read.
+        MembraneError: the file is not named after the first view, or no view's image can be read.
     """
     images: list[np.ndarray | None] = []
     lacking: dict[str, str] = {}
@@ -92,12 +94,11 @@ def read_views(path: Path, views: Sequence[View], like: Tensor) -> MomentImages:
 
 
 def view_files(path: Path, names: Sequence[str]) -> list[Path]:
-    """The image files of a frame, of all views.
+    """Return the paths of the images of all views of one frame.
 
     Args:
-        path: path of the first view's image, NAME_VIEW and an ending; the others have the same name and ending with the name of
-            their view.
-        names: names of the views that have images of their own; none of one view, or of regions of one image.
+        path: path of the first view's image, `NAME_VIEW.ENDING`; the images of the other views differ in `VIEW` only.
+        names: names of the views that have images of their own; empty for one view, or if views are regions of one image.
 
     Raises:
         MembraneError: the file is not named after the first view.
@@ -116,14 +117,14 @@ def view_files(path: Path, names: Sequence[str]) -> list[Path]:
 
 
 def first_view_image(grey: Tensor, views: Sequence[View]) -> Tensor:
-    """The first view's image `[height, width]` of the grey image `[1, C, ...]` of a frame; that of a sensor with one view."""
+    """Return the first view's image `[height, width]` from the grey images `[1, C, ...]` of a frame."""
     left, top = (views[0].region or (0, 0))[:2] if views else (0, 0)
     width, height = views[0].camera.image_size if views else (grey.shape[-1], grey.shape[-2])
     return grey[0, 0, top : top + height, left : left + width]
 
 
 def first_view_picture(picture: np.ndarray | list[np.ndarray | None], views: Sequence[View]) -> np.ndarray | None:
-    """The first view's part of a picture, or its own of a list of all views'; that of a sensor with one view as it is."""
+    """Return the first view's region of a picture, or the first of a list of pictures; with one view, the whole picture."""
     if not isinstance(picture, np.ndarray):
         return picture[0]
     left, top, width, height = (views[0].region if views else None) or (0, 0, *picture.shape[1::-1])
@@ -131,5 +132,5 @@ def first_view_picture(picture: np.ndarray | list[np.ndarray | None], views: Seq
 
 
 def _as_batch(images: Any) -> Any:
-    """Three grey frames `[3, H, W]` as such, which are no colours here."""
+    """Add a channel axis to frames `[B, H, W]`, so that three grey frames are not mistaken for one colour image."""
     return images[:, None] if images.ndim == 3 and images.shape[-1] != 3 else images

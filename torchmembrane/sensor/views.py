@@ -1,4 +1,4 @@
-"""Several views of one membrane: cameras, or mirrors, each with its pose, and the rest surface as each of them sees it."""
+"""Several views of one membrane, by cameras or mirrors: their poses, and the rest surface in the frame of each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -16,26 +16,26 @@ from .parts import Surface
 SIDES = ("inside", "outside")
 MOST_VIEWS = 8
 FEWEST_LINES = 25
-"""Fewest lines of the solver's grid: two views see the shape so well that a coarser grid dominates the error of forces."""
+"""Fewest lines per side of the solver grid with several views: a coarser grid would dominate the error of forces."""
 SAME_PLACE = 1e-9
-"""Largest entry by which the first view's pose may differ from none."""
+"""Largest difference of any entry of the first view's pose from the identity."""
 
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class View:
-    """One view of a membrane by several cameras or mirrors.
+    """One view of a membrane that several cameras or mirrors see.
 
     Args:
-        name: one word, also of the files of its images.
-        camera: the calibrated `Camera`; of a region of a shared image that of the region, `camera.in_mode(region)`.
-        pose: pose of the view's frame in the first view's; it reflects for a mirror.
-        rest_image: as of `Markers`, without contact; None: displacements are then from where the model sees the markers.
-        side: side of the membrane at which it looks, "inside" | "outside".
-        is_region: whether it is a region of an image that all views share.
+        name: name of the view, one word; the view's image files are named with it.
+        camera: the calibrated `Camera`; for a region of a shared image, that of the region: `camera.in_mode(region)`.
+        pose: pose of the view's frame in the first view's frame; a mirror's pose includes a reflection.
+        rest_image: image without contact, as for `Markers`; None: displacements are measured from the projected rest markers.
+        side: side of the membrane that the view sees, "inside" | "outside".
+        is_region: whether the view is a region of an image that all views share.
 
     Raises:
-        MembraneError: names the value, what came and what was expected.
+        MembraneError: a value is invalid; the message names it and says what was expected.
 
     Example:
         >>> camera = Camera("pinhole", (640, 480), (400, 400), (320, 240))
@@ -63,11 +63,11 @@ class View:
 
     @property
     def region(self) -> tuple[int, int, int, int] | None:
-        """Left, top, width, height in the shared image, px; None: the view has images of its own."""
+        """Left, top, width and height of the region in the shared image, px; None: the view has images of its own."""
         return tuple(self.camera.mode.crop) if self.is_region and self.camera.mode is not None else None  # type: ignore[return-value]
 
     def with_camera(self, camera: Camera) -> "View":
-        """The view with another lens or other ports, found in its own images; of a region the camera is of the region's pixels.
+        """Return the view with another camera (lens and ports), for the pixels of the view's own images or region.
 
         Example:
             >>> whole = Camera("pinhole", (640, 480), (400, 400), (320, 240))
@@ -86,15 +86,15 @@ class View:
         return replace(self, camera=whole.in_mode(self.region))
 
     def membrane(self, membrane: Membrane) -> Membrane:
-        """The membrane in the view's frame; its outward normals point away from the view's camera, also of one outside."""
+        """Return the membrane in the view's frame; its outward normals point away from the view's camera on either side."""
         return membrane.in_frame(self.pose.inverse, outside=self.side == "outside")
 
     def height(self, height: float | np.ndarray) -> float | np.ndarray:
-        """The markers' height along the normals that point to the view's camera: of one outside the other way."""
+        """Return the markers' height along the normals that point to the view's camera: negated for "outside"."""
         return -height if self.side == "outside" else height
 
     def described(self) -> dict[str, Any]:
-        """Name, pose, region and side, as keys of the sensor's file."""
+        """Return name, pose, region and side by the keys of the sensor's file."""
         return {
             "name": self.name,
             "pose": self.pose.matrix.tolist(),
@@ -104,10 +104,10 @@ class View:
 
 
 class SurfaceInView(Surface):
-    """A rest surface in the frame of a view, which may see a part of it only.
+    """A rest surface in the frame of a view, which may see only a part of it.
 
     Args:
-        surface: in the first view's frame.
+        surface: the rest surface in the first view's frame.
         view: the view.
     """
 
@@ -121,19 +121,19 @@ class SurfaceInView(Surface):
     view: View
 
     def membrane(self, grid: tuple[int, int]) -> Membrane:
-        """The rest surface on a solver grid, in the view's frame."""
+        """Return the rest surface on a solver grid, in the view's frame."""
         return self.view.membrane(self.whole.membrane(grid))
 
 
 def refuse_views(views: Sequence[View], has_listed_dots: bool) -> None:
-    """Refuse views that do not go together.
+    """Raise an error if the views of a sensor are inconsistent.
 
     Args:
-        views: all of a sensor's, the first one first.
-        has_listed_dots: whether the markers are dots of a list.
+        views: all views of the sensor, in order.
+        has_listed_dots: whether the markers are dots with listed positions.
 
     Raises:
-        MembraneError: names the view, what came and what was expected.
+        MembraneError: the views are inconsistent; the message names the view, the value found and what was expected.
     """
     expect(len(views) <= MOST_VIEWS, "views", len(views), f"at most {MOST_VIEWS}")
     names = [view.name for view in views]

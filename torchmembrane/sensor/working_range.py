@@ -1,4 +1,4 @@
-"""The range in which a sensor's answers were shown right: a result beyond it keeps its answer, with status 9."""
+"""The validated working range of a sensor: a result outside it keeps its values and gets status 9."""
 
 from math import ceil, cos, inf, radians
 from pathlib import Path
@@ -11,21 +11,21 @@ from ..surface.membrane import Membrane
 from .table import Table, toml_lines
 
 TURNED = 0.02
-"""Share of the vertices that may have turned further."""
+"""Share of the vertices whose normals may have turned by more than the limit."""
 HEAD = """\
 # The range in which `torchmembrane check --accuracy` showed this sensor's answers right; results beyond it get status 9.
 # depth: over the surface's size; turn: degrees by which the surface turns; force: the sensor's force unit"""
 
 
 class WorkingRange(NamedTuple):
-    """Limits of what is found, not of what is true.
+    """Limits of reconstructed (not true) quantities.
 
     Attributes:
-        depth: the deepest displacement along the inward rest normal, over the surface's size.
-        turn: the angle by which all but `TURNED` of the vertices' normals turn at most, degrees: beside the rim a press that
-            is not deep turns the surface far.
-        force: magnitude of the contact force, the sensor's force unit.
-        sensor: fingerprint of the sensor that it was found for; empty: of any.
+        depth: largest displacement along the inward rest normal, over the surface's size.
+        turn: largest rotation of the vertices' normals, degrees, except for the share `TURNED` of the vertices: beside the rim
+            even a shallow press rotates the surface far.
+        force: largest magnitude of the contact force, the sensor's force unit.
+        sensor: fingerprint of the sensor for which the range was found; empty: valid for any sensor.
     """
 
     depth: float
@@ -35,29 +35,29 @@ class WorkingRange(NamedTuple):
 
     @classmethod
     def from_file(cls, path: Path) -> "WorkingRange":
-        """Read what `to_file` wrote.
+        """Read a range that `to_file` has written.
 
         Raises:
-            MembraneError: the file cannot be read, or holds something else.
+            MembraneError: the file cannot be read, or is not such a file.
         """
         table = Table.from_file(path)
         table.allow(cls._fields)
         return cls(table.number("depth"), table.number("turn"), table.number("force"), table.text("sensor"))
 
     def to_file(self, path: Path) -> None:
-        """Write it as TOML, whole or not at all."""
+        """Write the range as TOML, atomically."""
         write_text(path, "\n".join([HEAD, *toml_lines("", self._asdict())]) + "\n")
 
     def for_fingerprint(self, fingerprint: str) -> "WorkingRange":
-        """This one where it was found for the sensor of this fingerprint, or for any; else `GENERAL`."""
+        """Return this range if it is valid for the sensor of this fingerprint, else `GENERAL`."""
         return self if self.sensor in ("", fingerprint) else GENERAL
 
     def is_beyond(self, x: Tensor, normals: Tensor, traction: Tensor, membrane: Membrane) -> Tensor:
-        """Whether what is found is outside, `[B]` bool; False where nothing is found.
+        """Return whether reconstructions are outside the range, `[B]` bool; False where a reconstruction is NaN.
 
         Args:
-            x: the surface, `[B, V, 3]`.
-            normals: its outward normals, unit, `[B, V, 3]`.
+            x: vertices of the reconstructed surface, `[B, V, 3]`.
+            normals: its outward unit normals, `[B, V, 3]`.
             traction: contact force per rest area, `[B, V, 3]`.
             membrane: the rest surface.
         """
@@ -69,23 +69,23 @@ class WorkingRange(NamedTuple):
 
 
 def turn_cosine(normals: Tensor, rest: Tensor) -> Tensor:
-    """The cosine of the angle that all but `TURNED` of the normals have turned by at most, `[B]`.
+    """Return the cosine of the angle that only the share `TURNED` of the normals exceeds, `[B]`.
 
     Args:
-        normals: unit, `[B, V, 3]`.
-        rest: the same at rest, `[V, 3]`.
+        normals: unit normals, `[B, V, 3]`.
+        rest: unit normals at rest, `[V, 3]`.
     """
     cosine: Tensor = (normals * rest).sum(-1).topk(ceil(TURNED * len(rest)), largest=False).values.amax(-1)
     return cosine
 
 
 GENERAL = WorkingRange(depth=0.175, turn=60.0)
-"""Range of sensors that have none of their own; `docs/accuracy.md` says on which sensors it was found."""
+"""Default range; `docs/accuracy.md` says on which sensors it was validated."""
 UNLIMITED = WorkingRange(depth=inf)
 
 
 def range_file(sensor: Path) -> Path:
-    """Where the range of a sensor file is kept.
+    """Return the path of the file that stores the range of a sensor file.
 
     Example:
         >>> range_file(Path("day/sensor.toml")).name
