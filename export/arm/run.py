@@ -1,4 +1,4 @@
-"""Images through a model by the edge package, every output into one file.
+"""Run images through a model with the edge package, and write all outputs to one file.
 
 python run.py FOLDER_OF_torchmembrane_edge MODEL.onnx IMAGES.npy OUT.npz [FOLDER_OF_PACKAGES]
 """

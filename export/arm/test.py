@@ -1,4 +1,4 @@
-"""The edge package on an emulated aarch64 system against the same here: every output of every image.
+"""Compare the edge package on an emulated aarch64 system with this machine: every output of every image.
 
 python export/arm/test.py FOLDER MODEL.onnx IMAGE...
 

@@ -1,4 +1,4 @@
-"""The C++ example against the Python package: the same status, wrench and pressure, and one line of error.
+"""Compare the C++ example with the Python package: the same status, wrench and pressure, and a one-line error.
 
 python export/cpp/test.py FRAME MODEL.onnx IMAGE...; FRAME is what `cmake --build` made of main.cpp.
 """

@@ -1,4 +1,4 @@
-"""Runs the models that `torchmembrane export` writes, with numpy and onnxruntime alone."""
+"""Run the models that `torchmembrane export` writes, with only numpy and onnxruntime."""
 
 __version__ = "0.2.0"
 

@@ -1,4 +1,4 @@
-"""The command `torchmembrane-edge`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage or model, 130 interrupted."""
+"""The command `torchmembrane-edge`. Exit codes: 0 success, 1 some frames failed, 2 wrong usage or model, 130 interrupted."""
 
 import argparse
 import glob
@@ -25,15 +25,15 @@ from .view_status import status_in_words
 
 FINISHED = (0, 3, 7, 8, 9, 10)  # ok; not converged, unexplained, partly hidden, out of range, a view left out: it is kept
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
-"""Of the files that are taken from a folder."""
+"""File extensions of the images that are taken from a folder."""
 OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
 MOST_BATCH, MOST_NUMBER = 256, 10**9 - 1
 SECONDS_PER_MB = 4
-"""That a core of a PC takes to load a model."""
+"""Seconds that a PC core takes to load a model, per MB."""
 
 
 def main(argv=None) -> int:
-    """Run the command with these arguments; returns the exit code."""
+    """Run the command with these arguments; return the exit code."""
     arguments = _parser().parse_args(argv)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -64,7 +64,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _checked(arguments: argparse.Namespace) -> list[Path]:
-    """The image files, after everything that is known without the model."""
+    """Return the image files, after all checks that do not need the model."""
     if arguments.camera is not None:
         if arguments.images or arguments.out:
             raise EdgeError("--camera with images or --out; a camera's results are printed: expected one or the other")
@@ -82,10 +82,10 @@ def _checked(arguments: argparse.Namespace) -> list[Path]:
 
 
 def image_files(arguments: Sequence[str]) -> list[Path]:
-    """Files, patterns and folders as files, in the order of the call; names as shells sort them, by the numbers in them.
+    """Resolve files, patterns and folders to files, in the order of the call; names as shells sort them, by their numbers.
 
     Raises:
-        EdgeError: an argument names no file, or two frames would have one name.
+        EdgeError: an argument matches no file, or two frames would have the same name.
     """
     paths = in_order(without_system_files([path for argument in arguments for path in _expanded(argument)]))
     files = {frame_name(path): path for path in paths}
@@ -103,12 +103,12 @@ def image_files(arguments: Sequence[str]) -> list[Path]:
 
 
 def in_order(paths: list[Path]) -> list[Path]:
-    """The paths as they are given; in the order of the numbers in their names where they come as shells expand a pattern."""
+    """Return the paths as given, or sorted by the numbers in their names if they are in the order of a shell's expansion."""
     return sorted(paths, key=numbered) if paths == sorted(paths) else paths
 
 
 def without_system_files(paths: list[Path]) -> list[Path]:
-    """The paths without files that macOS and Windows leave in folders, which a shell's pattern may give too."""
+    """Return the paths without the files that macOS and Windows leave in folders, which a shell pattern may match."""
     return [path for path in paths if not OF_SYSTEM.fullmatch(path.name)] or paths
 
 
@@ -129,9 +129,10 @@ def _expanded(argument: str) -> list[Path]:
 
 
 def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> int:
-    """Every frame's result as `NAME.npz` in the folder `out`, with `mesh.npz` and `summary.csv`, and a line for each.
+    """Write each frame's result as `NAME.npz` to the folder `out`, with `mesh.npz` and `summary.csv`, and print a line for
+    each.
 
-    A model that tracks takes the frames for a video.
+    A tracking model treats the frames as a video.
     """
     results.begin(out, session.mesh)
     summary = Summary(out, session)
@@ -157,24 +158,24 @@ def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> i
 
 
 def _joined(images: list) -> np.ndarray | list[np.ndarray]:
-    """The images of frames as one batch; of several views one of each."""
+    """Join the images of frames into one batch, or into one batch per view."""
     if isinstance(images[0], list):
         return [np.concatenate(view) for view in zip(*images, strict=True)]
     return np.concatenate(images)
 
 
 def _frames(path: Path, session: Session) -> Iterator[Frame]:
-    """The frames of a file, with the images of all views that have files of their own."""
+    """Yield the frames of a file, with the images of all views that have files of their own."""
     if not session.views:
         return frames(path, session.image_size, session.bits)
     return view_frames(path, session.views, session.image_sizes, session.bits)
 
 
 def first_views(paths: list[Path], views: Sequence[str]) -> list[Path]:
-    """The first view's files among those of all `views`, NAME_VIEW; all paths where the views have no files of their own.
+    """Return the first view's files among those of all `views`, NAME_VIEW; all paths if the views have no files of their own.
 
     Raises:
-        EdgeError: a file is of none of the views, or none is the first one's beside it.
+        EdgeError: a file belongs to no view, or the first view's file beside it is missing.
     """
     if not views:
         return paths
@@ -187,7 +188,7 @@ def first_views(paths: list[Path], views: Sequence[str]) -> list[Path]:
 
 
 def _kept(session: Session, frame: Frame, result: dict | None, seconds: float, summary: Summary) -> int:
-    """Write a frame's result and say what was found; returns its status."""
+    """Write a frame's result and print a line about it; return its status."""
     if result is None:
         summary.add(frame.name, frame.path, f"unreadable: {frame.reason}", None, {})
         print(frame.says(frame.reason), file=sys.stderr)
@@ -204,7 +205,7 @@ def _kept(session: Session, frame: Frame, result: dict | None, seconds: float, s
 
 
 def watch(session: Session, camera: int, frames: int | None) -> int:
-    """Images of a camera, a line each: what was found and how long it took; Ctrl-C ends it."""
+    """Process the images of a camera, and print the result and the time of each on a line; Ctrl-C ends the loop."""
     import cv2
 
     if session.views:
@@ -239,7 +240,7 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
 
 
 def _red_first(image: np.ndarray) -> np.ndarray:
-    """A frame of OpenCV's - grey, BGR or BGRA - as grey `[height, width]` or RGB."""
+    """Convert a frame of OpenCV (grey, BGR or BGRA) to grey `[height, width]` or RGB."""
     channels = 1 if image.ndim == 2 else image.shape[-1]
     if channels == 1:
         return image.reshape(image.shape[:2])
@@ -249,7 +250,7 @@ def _red_first(image: np.ndarray) -> np.ndarray:
 
 
 def line(session: Session, result: dict) -> str:
-    """What was found in a frame, from its arrays: status, deepest displacement, force and contacts."""
+    """Return a line on a frame's result: status, deepest displacement, force and contacts."""
     status = int(result["status"])
     text = session.status_text(status)
     if status not in FINISHED:
@@ -272,7 +273,7 @@ def _vector(found: dict, name: str) -> str:
 
 
 def _whole(least: int, most: int) -> Callable[[str], int]:
-    """The type of a whole number within bounds."""
+    """Return the argument type of a whole number within bounds."""
 
     def number(text: str) -> int:
         if not re.fullmatch("[0-9]{1,9}", text) or not least <= int(text) <= most:

@@ -1,4 +1,4 @@
-"""Image files as grey frames, read by Pillow: one frame of an image, one of each picture of a file that holds several."""
+"""Image files read as grey frames with Pillow: one frame per picture, of a file with one or several pictures."""
 
 import io
 import re
@@ -21,13 +21,13 @@ from .timestamps import time_in
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "PPM")
 MOST_BYTES = 2**28
 LONGEST_NAME = 251
-"""Bytes of a frame's name, so that there can be a file NAME.npz."""
+"""Largest length of a frame name in bytes, such that a file NAME.npz can exist."""
 EXPECTED = "a whole PNG, JPEG or TIFF"
 KIND, OLD_KIND, WIDTH, HEIGHT, BITS, PHOTOMETRIC = 254, 255, 256, 257, 258, 262
 DESCRIPTION, ORIENTATION, SAMPLE = 270, 274, 339
-"""Tags of a TIFF's page."""
+"""Tag numbers of a TIFF page."""
 REDUCED_OR_MASK, OLD_REDUCED, WHITE_IS_ZERO, SIGNED = 0b101, 2, 0, 2
-"""Values of the first, second, sixth and last of these."""
+"""Values of the first, second, sixth and last of these tags."""
 UNTURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda values: values[:, ::-1],
     3: lambda values: values[::-1, ::-1],
@@ -37,13 +37,14 @@ UNTURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda values: values[::-1, ::-1].swapaxes(0, 1),
     8: lambda values: np.rot90(values, -1),
 }
-"""By a TIFF's orientation, by which Pillow turns it: an image as it is stored. Cameras turn no image of a sensor."""
+"""For each TIFF orientation, the function that undoes Pillow's rotation or reflection. Sensor cameras do not rotate images."""
 IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
 
 
 class Frame(NamedTuple):
-    """A frame to compute: `image [1, height, width]`, grey in 0..1, of several views a list of them, or the reason why there is
-    none; `origin`: of its file, as results hold it; `lacking`: why views have no image, by their names: theirs is NaN."""
+    """A frame to compute: `image [1, height, width]`, grey in 0..1, or a list with the image of each view; or the reason why
+    there is none. `origin`: provenance of its file, as stored in the results; `lacking`: reason for each missing view, by name;
+    its results are NaN."""
 
     name: str
     path: Path
@@ -53,16 +54,16 @@ class Frame(NamedTuple):
     lacking: Mapping[str, str] = {}
 
     def says(self, message: str) -> str:
-        """A line of a message about this frame."""
+        """Return a line of a message about this frame."""
         picture = "" if self.name == frame_name(self.path) else f", {self.name}"
         return printable(f"{self.path}{picture}: {message}")
 
 
 def frames(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterator[Frame]:
-    """The frames of a file: of an image NAME, of a file that holds several pictures NAME_000000, NAME_000001 ...
+    """Yield the frames of a file: NAME for a single image, and NAME_000000, NAME_000001, ... for several pictures.
 
-    Arguments: `size`, width and height that they must have; `bits` of the sensor, where files of 16 bits hold fewer.
-    Whatever is wrong with one of them is its `reason`. Reduced copies in a TIFF (thumbnails) are passed over.
+    Arguments: `size`, the required width and height; `bits`, the bit depth of the camera, if 16-bit files use fewer bits. An
+        error in a picture is reported as the `reason` of its frame. Reduced copies in a TIFF (thumbnails) are skipped.
     """
     name = frame_name(path)
     if len(name.encode()) > LONGEST_NAME:
@@ -87,9 +88,9 @@ def frames(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterat
 
 
 def view_frames(path: Path, views: Sequence[str], sizes: Sequence[tuple[int, int]], bits: int | None) -> Iterator[Frame]:
-    """The same of several views that have files of their own, NAME_VIEW: an image of each, for `path`, the first view's.
+    """Yield the frames of several views that have files of their own, NAME_VIEW; `path` is the first view's file.
 
-    A view without an image is left out of the frame; a frame without any has the reasons.
+    A view without an image is left out of the frame; a frame without any image has the reasons.
 
     Raises:
         EdgeError: the file is not named after the first view.
@@ -119,38 +120,38 @@ def view_frames(path: Path, views: Sequence[str], sizes: Sequence[tuple[int, int
 
 
 def _of_first(path: Path, frame: Frame) -> str:
-    """The name of a frame of several views, that of the first one's file with the number of the picture."""
+    """Return the name of a frame of several views: the name of the first view's file, with the number of the picture."""
     return frame_name(path) + frame.name.removeprefix(frame_name(frame.path))
 
 
 def _joined(files: Sequence[Path]) -> dict[str, Any]:
-    """Size, time and digest of all views' files, as `_origin` has those of one."""
+    """Return size, time and hash of all views' files, in the form of `_origin` for one file."""
     stats, digest = [file.stat() for file in files], blake2b(b"".join(file.read_bytes() for file in files), digest_size=16)
     sizes = {"file_size": sum(stat.st_size for stat in stats), "file_modified": max(stat.st_mtime_ns for stat in stats)}
     return sizes | {"content_hash": digest.hexdigest()}
 
 
 def frame_name(path: Path) -> str:
-    """The name of a file's frame: the file's, without its ending, in UTF-8."""
+    """Return the name of a file's frame: the file name without its extension, in UTF-8."""
     return printable(path.stem)
 
 
 def _origin(path: Path, content: bytes, time: float) -> dict[str, Any]:
-    """What results say of the file that they are of."""
+    """Return what the results store about their source file."""
     stat, digest = path.stat(), blake2b(content, digest_size=16).hexdigest()
     known = {"path": printable(path), "file_size": stat.st_size, "file_modified": stat.st_mtime_ns}
     return known | {"content_hash": digest, "time": time}
 
 
 def numbered(name: str | Path) -> tuple[list[tuple[int, str]], str]:
-    """A key to sort names or paths by: numbers within them count as numbers."""
+    """Return a sort key for names or paths in which numbers are compared by value."""
     parts = re.split("([0-9]+)", str(name))  # texts at even places, numbers at odd ones
     digits = [part.lstrip("0") for part in parts]
     return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(name)
 
 
 def pictures(path: Path) -> int:
-    """How many pictures a file holds; none where it is not readable."""
+    """Return the number of pictures in a file; 0 if it cannot be read."""
     try:
         with _opened(path) as (image, content):
             return len(_numbers(image, content)[0])
@@ -160,7 +161,7 @@ def pictures(path: Path) -> int:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, bytes]]:
-    """An image whose header is read, and its file's content; whatever Pillow finds wrong inside is an `EdgeError`."""
+    """Open an image and read its header; yield it and its file's content. Pillow's errors are raised as `EdgeError`."""
     from PIL import Image
 
     Image.MAX_IMAGE_PIXELS = None  # sizes are compared with the sensor's before pixels are decoded
@@ -182,7 +183,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, bytes]]:
 
 @contextmanager
 def _refused() -> Iterator[None]:
-    """Whatever Pillow raises of damaged files, which has no common base, as an `EdgeError`."""
+    """Raise any error of Pillow on damaged files, which have no common base class, as an `EdgeError`."""
     try:
         yield
     except EdgeError:
@@ -194,9 +195,9 @@ def _refused() -> Iterator[None]:
 
 
 def _numbers(image: Any, content: bytes) -> tuple[list[int], bool]:
-    """Numbers of the pictures, in order, and whether the file is cut behind the last, where Pillow takes it for whole.
+    """Return the indices of the pictures, in order, and whether the file is truncated after the last one unnoticed by Pillow.
 
-    What belongs to a picture is passed over: previews and masks of a TIFF, pictures of other sizes of an MPO.
+    Auxiliary pictures are skipped: previews and masks in a TIFF, and pictures of another size in an MPO.
     """
     if image.format != "TIFF":
         cut = image.format == "GIF" and not content.rstrip(b"\0").endswith(b";")
@@ -219,7 +220,8 @@ def _numbers(image: Any, content: bytes) -> tuple[list[int], bool]:
 
 
 def _is_preview(image: Any, number: int, size: tuple[int, int]) -> bool:
-    """Whether a picture of an MPO is of another size than the first; of one that is cut this is not known."""
+    """Return whether a picture of an MPO has another size than the first; False for a truncated picture, whose size is
+    unknown."""
     with suppress(Exception):
         image.seek(number)
         return image.size != size
@@ -227,7 +229,7 @@ def _is_preview(image: Any, number: int, size: tuple[int, int]) -> bool:
 
 
 def _sought(image: Any) -> Iterator[int]:
-    """Numbers of the pictures that can be reached."""
+    """Yield the indices of the pictures that can be reached."""
     with suppress(Exception):  # Pillow raises what it likes where a file is cut
         for number in count():
             image.seek(number)
@@ -235,7 +237,7 @@ def _sought(image: Any) -> Iterator[int]:
 
 
 def _directories(tiff: bytes) -> tuple[int, bool]:
-    """How many whole directories, one for each picture, a TIFF has, and whether another should follow."""
+    """Return how many complete directories, one per picture, a TIFF has, and whether another should follow."""
     order, big = "<" if tiff.startswith(b"II") else ">", b"+" in tiff[2:4]
     (number, entry, place), at = ("Q", 20, "Q") if big else ("H", 12, "L"), 8 if big else 4
     seen: set[int] = set()
@@ -260,7 +262,7 @@ def _refuse_size(image: Any, size: tuple[int, int]) -> None:
 
 
 def _grey(image: Any, number: int, size: tuple[int, int], bits: int | None) -> np.ndarray:
-    """One of the pictures of an opened image as grey values `[1, height, width]`."""
+    """Return one picture of an opened image as grey values `[1, height, width]`."""
     with _refused():
         image.seek(number)
         _refuse_size(image, size)
@@ -278,13 +280,13 @@ def _grey(image: Any, number: int, size: tuple[int, int], bits: int | None) -> n
 
 
 def _as_stored(seen: np.ndarray, tags: Mapping[int, Any]) -> np.ndarray:
-    """Grey values `[1, height, width]` that Pillow has turned, if it has, as their file stores them."""
+    """Return grey values `[1, height, width]` as stored in the file, with any rotation by Pillow undone."""
     turn = UNTURNED.get(tags.get(ORIENTATION, 1))
     return seen if turn is None else np.ascontiguousarray(turn(seen[0])[None])
 
 
 def _grey_of_more_bits(image: Any, tags: Mapping[int, Any], bits: int | None) -> np.ndarray:
-    """Grey values of whole numbers of more than 8 bits, or of float."""
+    """Return the grey values of integers of more than 8 bits, or of floats."""
     if tuple(tags.get(BITS, ())) == (12,):
         bits = 12
     elif image.tile and image.tile[0][0] == "ppm":  # Pillow multiplies what a PGM says is white to 65535
@@ -302,6 +304,6 @@ def _grey_of_more_bits(image: Any, tags: Mapping[int, Any], bits: int | None) ->
 
 
 def _layout(image: Any) -> str:
-    """How Pillow unpacks a file's values, as "RGB;16B"."""
+    """Return the layout in which Pillow unpacks a file's values, such as "RGB;16B"."""
     given = image.tile[0][3] if image.tile else ""
     return str(given if isinstance(given, str) else given[0])

@@ -1,4 +1,4 @@
-"""What a model says of its sensor, checked: the file may be damaged, or of somebody else's making."""
+"""Validation of a model's metadata on its sensor: the file may be damaged or come from an untrusted source."""
 
 import json
 import re
@@ -26,14 +26,14 @@ MESH_ARRAYS = {
     "image_size": (WHOLE, (2,)),
     "camera_in_tool": (NUMBERS, ("R", 4)),
 }
-"""Of the mesh: kind and shape; letters stand for numbers of vertices, triangles, dots and rows (3, or none)."""
+"""Dtype kind and shape of each mesh array; letters stand for numbers of vertices, triangles, dots and rows (3, or none)."""
 
 
 class Metadata(NamedTuple):
-    """What a model says of its sensor.
+    """A model's metadata on its sensor.
 
-    Attributes: `name`, `length_unit`, `force_unit`; `status_texts`, code to text; `mesh`, what `mesh.npz` holds; `bits` of the
-    camera, where images of 16 bits hold fewer, else None.
+    Attributes: `name`, `length_unit`, `force_unit`; `status_texts`, from code to text; `mesh`, the content of `mesh.npz`;
+        `bits`, the bit depth of the camera, if 16-bit images use fewer bits, else None.
     """
 
     name: str
@@ -45,10 +45,10 @@ class Metadata(NamedTuple):
 
     @classmethod
     def from_properties(cls, known: dict[str, str], model: str) -> "Metadata":
-        """From a model's metadata; `model` is its path, for messages.
+        """Return the checked metadata of a model; `model` is its path, for messages.
 
         Raises:
-            EdgeError: something is missing, or not what `torchmembrane export` writes.
+            EdgeError: an entry is missing, or is not in the format of `torchmembrane export`.
         """
         if known.get("format") != FORMAT:
             raise EdgeError(f"{model}: format {known.get('format')!r}; expected {FORMAT!r}, of {EXPECTED}")
@@ -73,7 +73,7 @@ class Metadata(NamedTuple):
 
 
 def _compare_versions(made: str, model: str) -> None:
-    """Warn of a model that a later version made: what it holds may be unknown here."""
+    """Warn about a model from a later version, whose content may be unknown to this version."""
     parts, here = (tuple(map(int, re.findall(r"\d+", version)[:2])) for version in (made, __version__))
     if parts > here:
         warnings.warn(
@@ -91,7 +91,7 @@ def _parsed(key: str, text: str) -> dict[str, Any]:
 
 
 def _mesh(found: dict[str, Any]) -> dict[str, Any]:
-    """The mesh with its arrays; others of its values, which older models may lack, are settings."""
+    """Return the mesh with its arrays converted; its other entries, which older models may lack, are settings."""
     found = {"camera_in_tool": []} | found
     if missing := [key for key in (*MESH_TEXTS, *MESH_ARRAYS) if key not in found]:
         raise ValueError(f"mesh lacks {missing[0]}")
@@ -108,7 +108,7 @@ def _mesh(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _array(key: str, value: Any, sizes: dict[str, int]) -> np.ndarray:
-    """An array of the mesh; `sizes` collects the lengths that letters stand for."""
+    """Return an array of the mesh; `sizes` collects the lengths that the letters stand for."""
     (kinds, dtype), shape = MESH_ARRAYS[key]
     array = np.array(value)
     if key == "rest_pixels" and array.ndim == 3:  # of several views

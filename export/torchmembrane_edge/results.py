@@ -1,4 +1,4 @@
-"""The folder of a call's results: `NAME.npz` of each frame and, once, `mesh.npz`."""
+"""The folder of a call's results: `NAME.npz` for each frame, and one `mesh.npz`."""
 
 import io
 import os
@@ -14,20 +14,20 @@ from .errors import EdgeError, in_one_line, printable
 MESH = "mesh.npz"
 SETTINGS = ("estimator", "energy", "element", "format", "volume", "flow", "smoothing", "locator", "rest", "pressure",
             "pressure_noise", "fields")  # fmt: skip
-"""Of the mesh: what all results of a folder share beside the sensor. Files written earlier lack some."""
+"""Mesh entries that all results in a folder share in addition to the sensor. Files of earlier versions lack some."""
 
 
 def refuse_file(out: Path) -> None:
-    """Refuse a folder for results that is a file."""
+    """Refuse a results path that is a file."""
     if out.exists() and not out.is_dir():
         raise EdgeError(f"--out {printable(out)}: is a file; expected a new folder, or one with earlier results of this sensor")
 
 
 def begin(out: Path, mesh: Mapping[str, Any]) -> None:
-    """Write `mesh.npz`, in a folder that is new or holds results of the same sensor and settings.
+    """Write `mesh.npz`, into a folder that is new or holds results of the same sensor and settings.
 
     Raises:
-        EdgeError: it holds others, or cannot be written.
+        EdgeError: the folder holds other results, or cannot be written to.
     """
     said = f"--out {printable(out)}"
     refuse_file(out)
@@ -52,10 +52,10 @@ def begin(out: Path, mesh: Mapping[str, Any]) -> None:
 
 
 def save(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays as a file, whole or not at all.
+    """Write arrays to a file atomically: completely or not at all.
 
     Raises:
-        EdgeError: it cannot be written.
+        EdgeError: the file cannot be written.
     """
     content = io.BytesIO()
     np.savez(content, **arrays)
@@ -63,10 +63,10 @@ def save(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def write(path: Path, content: bytes | memoryview) -> None:
-    """Write a file's content, whole or not at all.
+    """Write the content of a file atomically: completely or not at all.
 
     Raises:
-        EdgeError: it cannot be written.
+        EdgeError: the file cannot be written.
     """
     partial = path.with_name(f".{blake2b(os.fsencode(path.name), digest_size=8).hexdigest()}-{os.getpid()}.partial")
     try:
@@ -81,7 +81,7 @@ def write(path: Path, content: bytes | memoryview) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The texts and numbers of an earlier `mesh.npz`."""
+    """Return the texts and numbers of an earlier `mesh.npz`."""
     try:
         with np.load(path) as file:
             found = {key: file[key].item() for key in ("name", "sensor", *SETTINGS) if key in file.files}

@@ -1,4 +1,4 @@
-"""A model, and images to results."""
+"""Run a model: from images to results."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
@@ -14,27 +14,27 @@ from .metadata import EXPECTED, Metadata
 GREY = (0.299, 0.587, 0.114)
 SHAPES = "[H, W], [H, W, 3], [B, H, W], [B, 1 | 3, H, W] or [B, H, W, 1 | 3]"
 IMAGE = "image"
-"""The input of images; of views that have images of their own one for each, `image_NAME`."""
+"""Name of the image input; for views with images of their own there is one input per view, `image_NAME`."""
 TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32}
 NEEDED = ("vertices", "displacement", "force", "status")
-"""Outputs without which there is no result."""
+"""Outputs that a result requires."""
 PREVIOUS = "previous_"
 MOST_THREADS = 256
 SEAL, DIGEST = b"2ISHA-256: ", 64  # the `doc_string` with which an exported file ends, and the characters that follow
 
 
 class Session:
-    """A model ready to run. Making one takes long, some 4 s for each MB of the file on one core: onnxruntime optimises it.
+    """A model ready to run. Loading takes about 4 s per MB of the file on one core, because onnxruntime optimises the model.
 
-    Arguments: `model`, the path of a file from `torchmembrane export`; `threads`, of which one is best for single frames;
-    `providers`, onnxruntime's, in order of preference.
+    Arguments: `model`, the path of a file from `torchmembrane export`; `threads`, the number of onnxruntime's threads (1 is
+        best for single frames); `providers`, those of onnxruntime, in order of preference.
 
-    Attributes: `name` of the sensor, `length_unit`, `force_unit`, `status_texts` (code to text), `mesh` (what `mesh.npz`
-    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether it follows dots; `bits` of the
-    camera, where images of 16 bits hold fewer, else None; `views`, the names of views that have images of their own, none of a
-    single view or of parts of one image; `image_sizes`, of each of them.
+    Attributes: `name` of the sensor, `length_unit`, `force_unit`, `status_texts` (code to text), `mesh` (the content of
+        `mesh.npz`: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether the model follows
+        dots; `bits`: bit depth of the camera, if 16-bit images use fewer bits, else None; `views`: names of the views that have
+        images of their own, empty for a single view or for regions of one image; `image_sizes`: the image size of each.
 
-    Raises: `EdgeError`: no such file, no model of `torchmembrane export`, or a provider that onnxruntime lacks.
+    Raises: `EdgeError`: the file does not exist, is not a model of `torchmembrane export`, or onnxruntime lacks a provider.
     """
 
     def __init__(self, model: str | Path, threads: int = 1, providers: Sequence[str] = ("CPUExecutionProvider",)):
@@ -66,14 +66,14 @@ class Session:
         self.image_size = self.image_sizes[0]
 
     def run(self, images: Any, previous: Mapping[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-        """Results of a batch, by name, one row per frame: vertices `[B, V, 3]`, ..., status `[B]`.
+        """Return the results of a batch by name, one row per frame: vertices `[B, V, 3]`, ..., status `[B]`.
 
-        `images`: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`, grey or RGB; uint8, uint16 (of
-        `bits`) or float in 0..1. A frame that cannot be reconstructed has a status and NaN. Of `views` a list of these, one for
-        each; None, or NaN in some frames, of a view without images, which is left out.
-        `previous`, for a model that tracks: the results of the frames before, where its dots are looked for first.
+        `images`: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`, grey or RGB; uint8, uint16 (with
+        `bits` used bits) or float in 0..1. A frame that cannot be reconstructed has a status and NaN. For several `views`, a
+        list with the images of each; a view without images is None, or NaN in single frames, and is left out. `previous`, for a
+        tracking model: results of the previous frames, near which the dots are searched first.
 
-        Raises `EdgeError`: images of another shape, size or type, or results of other frames.
+        Raises `EdgeError`: the images have another shape, size or type, or `previous` holds results of other frames.
         """
         if missing := [name for name in NEEDED if name not in self._outputs]:
             raise EdgeError(f"the model of {self.name!r} gives no {missing[0]}; expected {EXPECTED}")
@@ -92,7 +92,7 @@ class Session:
         return results
 
     def _fed(self, images: Any) -> dict[str, np.ndarray]:
-        """The inputs of images, by their names."""
+        """Return the model's image inputs, by name."""
         views = ", ".join(self.views)
         if self.views and not (isinstance(images, list | tuple) and len(images) == len(self.views)):
             raise EdgeError(f"images are not a list of {len(self.views)}; expected one with those of the views {views}")
@@ -112,7 +112,7 @@ class Session:
         return {name: parts.get(name, blank[name]) for name in self._images}
 
     def track(self, images: Any) -> Iterator[dict[str, np.ndarray]]:
-        """Results of a video's images, one after another, dots followed from each to the next (a generator)."""
+        """Yield the results of a video's images one by one; the dots are tracked from each image to the next."""
         if not self.tracks:
             raise EdgeError(
                 f"the model of {self.name!r} does not track; expected one of dots from `torchmembrane export --tracking`"
@@ -126,11 +126,11 @@ class Session:
             yield previous
 
     def status_text(self, code: int) -> str:
-        """What a status says, also one that the model has no text for."""
+        """Return the text of a status, even if the model has none for it."""
         return self.status_texts.get(int(code), f"status {int(code)}")
 
     def wrench_in_tool(self, results: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The wrench of results `[B, 6]` in the frame of the sensor's tool: force, and moment about that frame's origin."""
+        """Return the wrench `[B, 6]` in the frame of the sensor's tool: force, and moment about that frame's origin."""
         pose = self.mesh["camera_in_tool"]
         if not len(pose):
             raise EdgeError(
@@ -144,7 +144,7 @@ class Session:
         return np.concatenate([force, moment + np.cross(translation, force)], -1)
 
     def _unlike(self, images: Sequence[Sequence[Any]]) -> str:
-        """What its inputs and outputs are not; "" of a model of `torchmembrane export`."""
+        """Return in what the model differs from one of `torchmembrane export`; "" if it does not."""
         width, height = self.mesh["image_size"].tolist()
         whole = self.mesh["rest_pixels"].ndim == 3  # parts of it are the views, of which the mesh has the first one's size
         for image in images or [[]]:
@@ -161,10 +161,10 @@ class Session:
 
 
 def model_file(model: str | Path) -> str:
-    """The path of a model as onnxruntime takes it.
+    """Return the path of a model in the form that onnxruntime takes.
 
     Raises:
-        EdgeError: there is no such file.
+        EdgeError: the file does not exist.
     """
     if not isinstance(model, str | Path):
         raise EdgeError(f"model {type(model).__name__}; expected the path of a model from `torchmembrane export`")
@@ -176,7 +176,7 @@ def model_file(model: str | Path) -> str:
 
 
 def _refuse_damaged(model: Path) -> None:
-    """Refuse a file whose content is not that of the digest at its end; a file without a digest is not checked."""
+    """Refuse a file whose content does not match the hash at its end; a file without a hash is not checked."""
     content, seal, digest = model.read_bytes().rpartition(SEAL)
     if len(digest) == DIGEST and seal and sha256(content).hexdigest().encode() != digest:
         cause = "damaged, its SHA-256 digest is wrong; expected the file as it was exported: copy it again, or export it again"
@@ -184,10 +184,10 @@ def _refuse_damaged(model: Path) -> None:
 
 
 def grey(images: Any, bits: int | None = None) -> np.ndarray:
-    """Grey values `[B, height, width]`, float32 in 0..1: 0.299 R + 0.587 G + 0.114 B.
+    """Convert images to grey values `[B, height, width]`, float32 in 0..1: 0.299 R + 0.587 G + 0.114 B.
 
     Arguments: `images`, `[height, width]`, `[B, height, width]` or `[B, height, width, 3]`; uint8, uint16 or float in 0..1;
-    `bits` that those of uint16 hold (default: 16).
+    `bits`, the number of bits that uint16 values use (default: 16).
     """
     images = _array(images)
     if images.ndim == 2:
@@ -222,7 +222,7 @@ def _array(images: Any) -> np.ndarray:
 
 
 def _arranged(images: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Images as `[B, H, W]` or `[B, H, W, 3]`, where `size` is width and height."""
+    """Return images as `[B, H, W]` or `[B, H, W, 3]`; `size` is width and height."""
     (width, height), shape = size, images.shape
     if shape[-2:] == (height, width) and images.ndim in (2, 3):
         return images.reshape(-1, height, width)
@@ -245,7 +245,7 @@ def _refusal(shape: tuple[int, ...], size: tuple[int, int]) -> str:
 
 
 def _state(key: str, shape: tuple[int, ...], previous: Mapping[str, np.ndarray] | None) -> np.ndarray:
-    """What a model that tracks is given of the frames before: NaN where there are none."""
+    """Return an input of a tracking model from the results of the previous frames; NaN if there are none."""
     if previous is None:
         return np.full(shape, np.nan, np.float32)
     values = np.asarray(previous.get(key) if isinstance(previous, Mapping) else previous)

@@ -1,4 +1,4 @@
-"""summary.csv of a folder of results, a row for every frame, as `torchmembrane reconstruct` writes it."""
+"""The table summary.csv of a results folder, with a row for every frame, in the format of `torchmembrane reconstruct`."""
 
 import csv
 import io
@@ -16,13 +16,13 @@ from .summary_row import NAMES, Column, cell, completed, escaped, in_units, numb
 
 SUMMARY, DICTIONARY = "summary.csv", "summary_columns.csv"
 UNREADABLE = -1
-"""Status of a frame that gave no image."""
+"""Status of a frame without a readable image."""
 
 
 class Summary:
-    """The table of a folder: rows of this call, and those of earlier calls for other frames.
+    """The table of a folder: rows of this call, and rows of earlier calls for other frames.
 
-    Arguments: `folder` of the results; `session`, whose results they are.
+    Arguments: `folder`, the folder of the results; `session`, the session that computed them.
     """
 
     def __init__(self, folder: Path, session: Session):
@@ -30,7 +30,7 @@ class Summary:
         self.rows = {row["name"]: row for row in _rows(self.path)}
 
     def add(self, name: str, file: Path, text: str, frame: Mapping[str, np.ndarray] | None, origin: Mapping[str, Any]) -> None:
-        """A row of a frame; `frame` are its arrays, None where the file gave no image; `origin` says `time`, `seconds` and
+        """Add a row for a frame; `frame`: its arrays, None if the file gave no image; `origin`: `time`, `seconds` and
         `content_hash`, as far as they are known."""
         session, found = self.session, {}
         if frame is not None:
@@ -46,7 +46,7 @@ class Summary:
         self.rows[written["name"]] = written
 
     def write(self) -> None:
-        """Write the table in the order of the frames' names, and the dictionary of its columns."""
+        """Write the table in the order of the frames' names, and the file that explains its columns."""
         write(self.path, _table(NAMES, (self.rows[name] for name in sorted(self.rows, key=numbered))))
         columns = in_units(self.session.length_unit, self.session.force_unit)
         write(self.path.with_name(DICTIONARY), _table(Column._fields, (column._asdict() for column in columns)))
@@ -61,7 +61,7 @@ def _table(header: Iterable[str], rows: Iterable[Mapping[str, str]]) -> bytes:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    """The rows of an earlier table, as they are written; none where its columns are others, or it cannot be read."""
+    """Return the rows of an earlier table as written; an empty list if its columns differ or it cannot be read."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace").replace("\0", "")
         rows = csv.DictReader(io.StringIO(text, newline=""))

@@ -1,6 +1,6 @@
-"""A row of summary.csv: its columns, what each means, and the cells that a frame's arrays give.
+"""A row of summary.csv: its columns, their meanings, and the cells computed from a frame's arrays.
 
-torchmembrane and torchmembrane-edge both have this file, the same to the letter.
+torchmembrane and torchmembrane-edge both contain identical copies of this file.
 """
 
 from collections.abc import Mapping
@@ -9,19 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 CONTACTS = 4
-"""Patches that have columns of their own."""
+"""Number of contact patches that have columns of their own."""
 AXES = "xyz"
 METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "um": 1e6, "inch": 1 / 0.0254}
-"""One metre in the length unit."""
+"""Length of one metre in each length unit."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
-"""What a spreadsheet takes for a formula when a cell begins with it, spaces aside: such a text gets a ' before it."""
+"""First characters, after spaces, of a cell that a spreadsheet reads as a formula: such a text is prefixed with '."""
 
 
 class Column(NamedTuple):
     """A column: its name, the unit of its numbers, and its meaning.
 
-    Units are words, or `length`, `force`, `moment`, `area` or `pressure`, which `in_units` says in the sensor's units; "text"
-    where there are no numbers.
+    Units are words, or `length`, `force`, `moment`, `area` or `pressure`, which `in_units` replaces by the sensor's units;
+    "text" if the column holds no numbers.
     """
 
     name: str
@@ -86,11 +86,11 @@ COLUMNS = (
 )
 NAMES = tuple(column.name for column in COLUMNS)
 TEXT = tuple(column.name for column in COLUMNS if column.unit == "text")
-"""Columns that the names of files, damaged images, results and `mesh.npz` give."""
+"""Columns of text, which file names, damaged images, results and `mesh.npz` provide."""
 
 
 def in_units(length_unit: str, force_unit: str) -> list[Column]:
-    """The columns with the sensor's units.
+    """Return the columns with the sensor's units.
 
     Example:
         >>> [column.unit for column in in_units("mm", "N") if column.name in ("deepest", "moment_x", "pressure", "time")]
@@ -103,13 +103,13 @@ def in_units(length_unit: str, force_unit: str) -> list[Column]:
 
 
 def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str, force_unit: str) -> dict[str, Any]:
-    """The numbers of a row that a frame's arrays give, NaN where nothing is known.
+    """Return the numbers of a row that are computed from a frame's arrays; unknown numbers are NaN.
 
     Args:
-        frame: arrays by the names of `Reconstruction`, and `gauge`, a reading; those that it lacks are unknown.
-        rest_normals: `[V, 3]`, of the rest surface.
-        length_unit: unit of its lengths.
-        force_unit: unit of its forces.
+        frame: arrays with the names of `Reconstruction`, and `gauge`, a reading; missing arrays are unknown.
+        rest_normals: normals of the rest surface, `[V, 3]`.
+        length_unit: length unit of the results.
+        force_unit: force unit of the results.
     """
     found: dict[str, Any] = {}
 
@@ -148,7 +148,7 @@ def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str
 
 
 def _rows(values: np.ndarray, width: int) -> np.ndarray:
-    """The first `CONTACTS` rows, `[CONTACTS, width]`, NaN where there are fewer."""
+    """Return the first `CONTACTS` rows, `[CONTACTS, width]`, with NaN for missing ones."""
     rows = np.full((CONTACTS, width), np.nan)
     given = values.reshape(len(values), width)[:CONTACTS]
     rows[: len(given)] = given
@@ -156,7 +156,7 @@ def _rows(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def cell(name: str, value: Any) -> str:
-    """A number as a cell: six digits, of times microseconds; empty where it is not known.
+    """Format a number as a cell: six digits, times to the microsecond; empty if it is unknown.
 
     Example:
         >>> cell("force", 1.23456789), cell("time", 1790509109.25), cell("contacts", 2), cell("force", float("nan"))
@@ -168,17 +168,18 @@ def cell(name: str, value: Any) -> str:
 
 
 def escaped(name: str, text: str) -> str:
-    """A cell as it is written: text that a spreadsheet would take for a formula gets a ' before it."""
+    """Return the text of a cell as written: text that a spreadsheet would read as a formula is prefixed with '."""
     return f"'{text}" if name in TEXT and is_formula(text) else text
 
 
 def unescaped(name: str, text: str) -> str:
-    """The cell that was written as this text."""
+    """Return the cell that was written as this text."""
     return text[1:] if name in TEXT and text.startswith("'") and is_formula(text) else text
 
 
 def completed(row: Mapping[str, str]) -> dict[str, str] | None:
-    """A row of a table as of this version: one that was written before the last columns came lacks them; None for another's.
+    """Return a row of a table in the format of this version, with columns added that earlier versions lack; None for a row of
+    another table.
 
     Example:
         >>> row = completed(dict.fromkeys(NAMES[:-1], "1"))
@@ -191,5 +192,5 @@ def completed(row: Mapping[str, str]) -> dict[str, str] | None:
 
 
 def is_formula(text: str) -> bool:
-    """Whether a spreadsheet would take a text for a formula."""
+    """Return whether a spreadsheet would read a text as a formula."""
     return text.lstrip("' ").startswith(FORMULA)

@@ -1,6 +1,6 @@
-"""Times that people and programs write into names: seconds since 1970, or a date with a time of the day.
+"""Times in names: seconds since 1970, or a date with a time of day.
 
-torchmembrane and torchmembrane-edge both have this file, the same to the letter.
+torchmembrane and torchmembrane-edge both contain identical copies of this file.
 """
 
 import math
@@ -8,21 +8,21 @@ import re
 from datetime import datetime
 
 SECONDS = re.compile(r"(?<!\d)(1\d{9})(?:[.,](\d{1,9})|_?(\d{9})|(\d{3}|\d{6}))?(?!\d)")
-"""Since 1970, with decimals after a point, or as milliseconds, microseconds or nanoseconds: 2001 to 2033."""
+"""Seconds since 1970 with decimals after a point, or milliseconds, microseconds or nanoseconds: 2001 to 2033."""
 DATE = re.compile(
     r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]?([0-2]\d)[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)"
     r"(?:[.,](\d{1,9})|(\d{3}|\d{6}|\d{9}))?(?!\d)"
 )
-"""Year, month, day, hour, minute, second, with decimals after a point or directly."""
+"""Year, month, day, hour, minute and second, with decimals after a point or directly appended."""
 
 
 def time_in(text: str) -> float:
-    """The time that a text holds, seconds since 1970; NaN where it holds none.
+    """Return the time in a text, seconds since 1970; NaN if there is none.
 
-    A date with a time of the day is taken for UTC: differences between frames are right wherever they were taken.
+    A date with a time of day is read as UTC: differences between frames are correct in any time zone.
 
     Args:
-        text: such as the name of an image file without its ending.
+        text: text such as the name of an image file without its extension.
 
     Example:
         >>> time_in("press_20260927T113829.250"), time_in("1790509109_250000000"), time_in("press_000012")

@@ -7,15 +7,16 @@ import numpy as np
 from .session import Session
 
 STILL = (1.0, 0.3, 0.005)
-"""px, degrees, scale: by how much the image of a camera that stands still is found to move at most."""
+"""Largest image motion found for a camera that stands still: px, degrees, scale."""
 LEFT_OUT = 10
-"""The status of a frame that is reconstructed without one of its views."""
+"""Status of a frame that was reconstructed without one of its views."""
 
 
 def status_in_words(session: Session, result: Mapping[str, np.ndarray], lacking: Mapping[str, str]) -> str:
-    """A frame's status as `torchmembrane reconstruct` says it.
+    """Return a frame's status in the words of `torchmembrane reconstruct`.
 
-    Arguments: `session` that gave it; `result`, its arrays; `lacking`, why views had no image, by their names.
+    Arguments: `session`, which computed the frame; `result`, its arrays; `lacking`, the reason for each view without an image,
+        by name.
     """
     status, views = int(result["status"]), session.mesh.get("view_names", "").split()
     text = session.status_text(status)
@@ -31,7 +32,7 @@ def status_in_words(session: Session, result: Mapping[str, np.ndarray], lacking:
 
 
 def moved_views(result: Mapping[str, np.ndarray], views: Sequence[str]) -> list[str]:
-    """Names of the views whose `camera_motion` says that their camera has moved against the rim since the rest image."""
+    """Return the names of the views whose camera has moved relative to the rim since the rest image, by `camera_motion`."""
     if "camera_motion" not in result:
         return []
     du, dv, degrees, scale = np.moveaxis(np.asarray(result["camera_motion"]), -1, 0)

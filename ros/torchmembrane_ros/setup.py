@@ -1,4 +1,4 @@
-"""The node as an ament package; its Python dependency, torchmembrane, is installed by pip beside it."""
+"""The node as an ament package; its Python dependency, torchmembrane, is installed separately with pip."""
 
 from glob import glob
 

@@ -1,4 +1,4 @@
-"""Arguments that several commands take, and types that turn an argument's text into a value or say what was expected."""
+"""Arguments shared by several commands, and argument types that convert a text to a value or state what was expected."""
 
 import math
 import re
@@ -11,18 +11,18 @@ from ..errors import MembraneError
 from .choices import ENERGIES, ESTIMATORS, FLOWS, LOCATORS
 
 Add: TypeAlias = Callable[..., Action]
-"""A parser's `add_argument`."""
+"""The type of a parser's `add_argument`."""
 
 
 def add_command(commands: Any, name: str, run: Callable[..., int], purpose: str, examples: str, *aliases: str) -> Add:
-    """Add a command's parser.
+    """Add the parser of a command.
 
     Args:
-        commands: what `add_subparsers` gave.
-        name: the command.
-        run: is called with the parsed arguments; returns the exit code.
-        purpose: one line, without capital and full stop.
-        examples: shown below the options.
+        commands: object returned by `add_subparsers`.
+        name: name of the command.
+        run: function called with the parsed arguments; it returns the exit code.
+        purpose: one line, without a capital letter or a full stop.
+        examples: text shown below the options.
         *aliases: other names of the command.
 
     Returns:
@@ -42,12 +42,12 @@ def add_command(commands: Any, name: str, run: Callable[..., int], purpose: str,
 
 
 def add_sensor(add: Add) -> None:
-    """The sensor file."""
+    """Add the argument of the sensor file."""
     add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
 
 
 def add_estimator(add: Add) -> None:
-    """How markers and the surface are found."""
+    """Add the options that choose how the markers and the surface are found."""
     named = f"{', '.join(ESTIMATORS)}, the name of an installed one, or MODULE:CLASS, your own"
     add("--estimator", metavar="NAME", default=ESTIMATORS[0], help=f"how the surface is found: {named} (default: %(default)s)")
     add("--energy", choices=ENERGIES, help="the membrane's elastic energy (default: the sensor file's)")
@@ -58,20 +58,20 @@ def add_estimator(add: Add) -> None:
 
 
 def add_force(add: Add) -> None:
-    """Whether files that are there may be written over."""
+    """Add the option that allows existing files to be overwritten."""
     add("--force", action="store_true", help="write over files that are there; never over those that the command reads")
 
 
 def add_device(add: Add) -> None:
-    """Where torch computes."""
+    """Add the option that chooses where torch computes."""
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that torch does not see here.
+    """Refuse a device that torch cannot use on this machine.
 
     Raises:
-        MembraneError: there is no CUDA.
+        MembraneError: CUDA is requested and not available.
     """
     import torch
 
@@ -80,16 +80,16 @@ def check_device(device: str) -> None:
 
 
 def add_rerun(add: Add) -> None:
-    """Whether frames are shown in the viewer Rerun."""
+    """Add the options that show frames in the Rerun viewer."""
     add("--rerun", action="store_true", help='show image, surface, contacts, wrench and pressure in Rerun (extra "rerun")')
     add("--save", metavar="FILE.rrd", type=Path, help="with --rerun: write this file and open no viewer")
 
 
 def wants_rerun(arguments: Namespace) -> bool:
-    """Whether `--rerun` was given.
+    """Return whether `--rerun` was given.
 
     Raises:
-        MembraneError: `--save` was, without it.
+        MembraneError: `--save` was given without `--rerun`.
     """
     if arguments.save is not None and not arguments.rerun:
         raise MembraneError(f"--save {arguments.save}: a file of Rerun; expected --rerun with it")
@@ -98,7 +98,7 @@ def wants_rerun(arguments: Namespace) -> bool:
 
 
 def positive(text: str) -> float:
-    """A positive number.
+    """Return a positive number.
 
     >>> positive("0.5")
     0.5
@@ -113,7 +113,7 @@ NEWTONS = {"N": 1.0, "mN": 1e-3, "kg": 9.80665, "g": 9.80665e-3}
 
 
 def weight(text: str) -> float:
-    """A force, N, from a weight with its unit.
+    """Return a force, N, from a weight with its unit.
 
     >>> weight("2N"), round(weight("200 g"), 4)
     (2.0, 1.9613)
@@ -125,7 +125,7 @@ def weight(text: str) -> float:
 
 
 def number_from(least: float, most: float, expected: str = "a number") -> Callable[[str], float]:
-    """The type of a number within bounds.
+    """Return the argument type of a number within bounds.
 
     >>> number_from(0, 1)("0.5")
     0.5
@@ -142,7 +142,7 @@ def number_from(least: float, most: float, expected: str = "a number") -> Callab
 
 
 def camera(text: str) -> int | str:
-    """A camera's number, or the path or address of its stream.
+    """Return the number of a camera, or the path or address of its stream.
 
     >>> camera("0"), camera("/dev/video0")
     (0, '/dev/video0')
@@ -151,16 +151,16 @@ def camera(text: str) -> int | str:
 
 
 def of_each_view(option: str, kind: str, given: Sequence[str], views: Sequence[str]) -> list[str]:
-    """What an option that may be repeated says of each view, VIEW=..., in the views' order; of one view what it says.
+    """Return the value of a repeatable option VIEW=... for each view, in the order of the views; for a single view, its value.
 
     Args:
-        option: as `--camera`.
-        kind: of what it gives, as `NUMBER`.
-        given: what it was given.
-        views: names of the views that have images of their own; none of one view, or of regions of one image.
+        option: name of the option, such as `--camera`.
+        kind: kind of its value, such as `NUMBER`.
+        given: texts given for the option.
+        views: names of the views with images of their own; empty for a single view, or for regions of one image.
 
     Raises:
-        MembraneError: more than one of one view, a view without, or one that there is not.
+        MembraneError: a view has no value or more than one, or the name of a view is unknown.
 
     Example:
         >>> of_each_view("--camera", "NUMBER", ["right=2", "left=0"], ["left", "right"])
@@ -178,7 +178,7 @@ def of_each_view(option: str, kind: str, given: Sequence[str], views: Sequence[s
 
 
 def file_name(text: str) -> str:
-    """A name for files of an output folder: nothing that leads out of it or hides there.
+    """Return a name for files in an output folder, which must not lead out of the folder or be hidden.
 
     >>> file_name("press 1")
     'press 1'
@@ -189,19 +189,19 @@ def file_name(text: str) -> str:
 
 
 def count(text: str) -> int:
-    """A whole number, 1 or more."""
+    """Return a whole number of at least 1."""
     if not re.fullmatch(r"[0-9]{1,12}", text) or int(text) < 1:
         raise ArgumentTypeError(f"{text[:40]!r}; expected a whole number, 1 or more, of at most 12 digits")
     return int(text)
 
 
 def count_or_auto(text: str) -> int | None:
-    """A whole number, 1 or more, or auto: None."""
+    """Return a whole number of at least 1, or None for auto."""
     return None if text == "auto" else count(text)
 
 
 def share(text: str) -> tuple[int, int]:
-    """The I-th of N parts, I/N.
+    """Return I and N of the I-th of N parts, written I/N.
 
     >>> share("2/8")
     (2, 8)
@@ -213,12 +213,12 @@ def share(text: str) -> tuple[int, int]:
 
 
 def seed(text: str) -> int:
-    """A whole number, 0 or more."""
+    """Return a whole number of at least 0."""
     return 0 if text == "0" else count(text)
 
 
 def vector(text: str) -> list[float]:
-    """Three numbers X,Y,Z.
+    """Return three numbers, written X,Y,Z.
 
     >>> vector("0.5,0,-1")
     [0.5, 0.0, -1.0]
@@ -227,12 +227,12 @@ def vector(text: str) -> list[float]:
 
 
 def positive_pair(expected: str) -> Callable[[str], list[float]]:
-    """The type of two positive numbers; `expected` says which in an error."""
+    """Return the argument type of two positive numbers; `expected` describes them in an error."""
     return lambda text: _values(text, positive, 2, expected)
 
 
 def count_pair(expected: str, most: int = 1000) -> Callable[[str], list[int]]:
-    """The type of two whole numbers, 1 or more; `expected` says which in an error.
+    """Return the argument type of two whole numbers of at least 1; `expected` describes them in an error.
 
     >>> count_pair("two counts, COLUMNS,ROWS")("11,8")
     [11, 8]
@@ -248,12 +248,13 @@ def count_pair(expected: str, most: int = 1000) -> Callable[[str], list[int]]:
 
 
 def numbers(expected: str) -> Callable[[str], list[int]]:
-    """The type of one or more whole numbers; `expected` says which in an error."""
+    """Return the argument type of one or more whole numbers; `expected` describes them in an error."""
     return lambda text: _values(text, int, None, expected)
 
 
 def some_of(choices: tuple[str, ...], expected: str) -> Callable[[str], list[str]]:
-    """The type of some of the choices, in any order, also repeated; `expected` says which in an error."""
+    """Return the argument type of some of the choices, in any order, with repetitions; `expected` describes them in an
+    error."""
 
     def chosen(text: str) -> list[str]:
         parts = text.split(",")
@@ -275,7 +276,7 @@ def _values(text: str, kind: Callable[[str], Any], number: int | None, expected:
 
 
 def pressure(text: str) -> float:
-    """A pressure with its unit, in hPa."""
+    """Return a pressure, hPa, from a number with its unit."""
     from ..presets.draft import PRESSURE_UNITS, pressure_in_hectopascal
 
     try:

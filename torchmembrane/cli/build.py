@@ -1,4 +1,4 @@
-"""The reconstructor that a command's options ask for."""
+"""Construction of the reconstructor from a command's options."""
 
 import os
 import sys
@@ -15,12 +15,12 @@ OPTIONS = ("flow", "smoothing", "pressure_noise")
 
 
 def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
-    """The reconstructor of `--estimator`, `--energy`, `--flow`, `--smoothing`, `--pressure-noise` and `--locator`.
+    """Return the reconstructor for `--estimator`, `--energy`, `--flow`, `--smoothing`, `--pressure-noise` and `--locator`.
 
-    An estimator MODULE:CLASS is looked for in the current directory first.
+    An estimator MODULE:CLASS is first searched in the current directory.
 
     Raises:
-        MembraneError: no such estimator, or an option that it does not have.
+        MembraneError: the estimator does not exist, or does not have one of the options.
     """
     if ":" in arguments.estimator and os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())  # and stays there: worker processes import the module as well

@@ -1,4 +1,4 @@
-"""`torchmembrane capture`: photographs of a camera, for rest images and weights."""
+"""`torchmembrane capture`: take photographs with a camera, for rest images and weights."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -20,11 +20,11 @@ TIME_VIEW.png.
 
 exit code: 0 all taken, 2 wrong usage, or a camera that gives no images (any more)"""
 LONGEST = 3600.0
-"""Seconds between photographs."""
+"""Longest time between photographs, seconds."""
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "capture", run, PURPOSE, EXAMPLES)
     size = "the sensor file, whose image size is asked for, or preset:NAME (default: the camera's own size)"
     add("sensor", metavar="SENSOR.toml", nargs="?", help=size)
@@ -36,7 +36,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Photograph; returns the exit code."""
+    """Take the photographs; return the exit code."""
     from ..files.atomic import make_folder
     from ..files.images import write_as_taken
     from ..live.capture import Photographs
@@ -57,7 +57,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _cameras(arguments: Namespace) -> "dict[str, tuple[int | str, tuple[int, int] | None, int | None]]":
-    """What opens each camera, the size that is asked for, and its bits; by what is added to its images' names."""
+    """Return, by the suffix of its image names, each camera with its requested image size and its bit depth."""
     from ..presets import sensor_file
     from ..sensor.sensor import Sensor
 

@@ -1,4 +1,4 @@
-"""`torchmembrane check`: what a sensor file means, in words and drawn, and what to expect of the sensor."""
+"""`torchmembrane check`: describe and draw the meaning of a sensor file, and what to expect of the sensor."""
 
 import os
 import sys
@@ -40,7 +40,7 @@ exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "check", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
@@ -61,7 +61,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Describe and draw the sensor; returns the exit code."""
+    """Describe and draw the sensor; return the exit code."""
     for name in ("seed", "noise", "jobs"):
         if getattr(arguments, name) is not None and not arguments.accuracy:
             raise MembraneError(f"--{name} goes with --accuracy only: add it")
@@ -109,7 +109,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _write_contact(sensor: "Sensor", folder: Path) -> None:
-    """The law of contact pressure beside the robot's model, and a line about it."""
+    """Write the contact-pressure law beside the robot model, and print a line about it."""
     from ..accuracy.contact_law import contact_law
     from ..integrations.contact_files import write_contact_law
 
@@ -125,7 +125,7 @@ def _write_contact(sensor: "Sensor", folder: Path) -> None:
 
 
 def _keep(range: "WorkingRange", path: Path) -> None:
-    """Keep the range beside the sensor file, and say so."""
+    """Store the working range beside the sensor file, and print where."""
     try:
         range.to_file(path)
         print(f"          kept in {path}: this sensor's results beyond it get status 9")
@@ -134,7 +134,7 @@ def _keep(range: "WorkingRange", path: Path) -> None:
 
 
 def _spare_files(arguments: Namespace, sensor: Path) -> None:
-    """Refuse a figure in the place of another file than an earlier figure of a sensor."""
+    """Refuse to overwrite any file other than an earlier figure of a sensor."""
     from functools import partial
 
     from ..files.targets import refuse_overwriting
@@ -145,7 +145,7 @@ def _spare_files(arguments: Namespace, sensor: Path) -> None:
 
 
 def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":
-    """The series that an interrupted command has finished, and a line that says so."""
+    """Return the series that an interrupted command has finished, and print how many there are."""
     from ..accuracy.finished import FinishedSeries
     from ..accuracy.spec_sheet import Effort
 
@@ -161,7 +161,7 @@ def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":
 
 
 def _sheet(sensor: "Sensor", arguments: Namespace, finished: "FinishedSeries") -> "SpecSheet":
-    """The sensor's spec sheet, printed."""
+    """Print and return the spec sheet of the sensor."""
     from ..accuracy.measure import spec_sheet
     from .sheet import sheet_lines
 

@@ -1,6 +1,6 @@
-"""What the command's options may be, and their defaults: written here once more, so that `--help` loads nothing heavy.
+"""Choices and defaults of the command's options, repeated here so that `--help` loads nothing heavy.
 
-A test holds every one of them to what the package itself has.
+A test compares all of them with the package.
 """
 
 ESTIMATORS = ("force-balance", "minimum-energy", "paper")

@@ -1,4 +1,4 @@
-"""What a sensor file means, in words."""
+"""Description of a sensor file in words."""
 
 from collections.abc import Iterable
 from datetime import date
@@ -24,7 +24,7 @@ from ..sensor.views import FEWEST_LINES
 
 COARSE = f"  coarse for several views, whose forces want {FEWEST_LINES} lines or more: give a finer grid"
 LISTED = 12
-"""Missing markers that are named one by one."""
+"""Largest number of missing markers that are listed individually."""
 FILLINGS = {
     "liquid": "liquid: its volume is kept",
     "gas": "gas: absolute pressure x volume is kept",
@@ -33,7 +33,7 @@ FILLINGS = {
 
 
 def rest_frame(reconstructor: Reconstructor) -> Frame | None:
-    """The frame of the sensor's own rest image, None where there is none."""
+    """Return the frame of the sensor's own rest image, or None if there is none."""
     sensor = reconstructor.sensor
     image: Any = sensor.markers.rest_image
     if sensor.views:
@@ -46,7 +46,7 @@ def rest_frame(reconstructor: Reconstructor) -> Frame | None:
 
 
 def pressure_in_words(pressure: float, sensor: Sensor) -> str:
-    """A pressure of a sensor's results, with its unit, and in hPa, as gauges and `--pressure` have it.
+    """Return a pressure of a sensor's results with its unit, and in hPa, the unit of gauges and of `--pressure`.
 
     Example:
         >>> from torchmembrane.presets import preset
@@ -60,7 +60,7 @@ def pressure_in_words(pressure: float, sensor: Sensor) -> str:
 
 
 def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame: Frame | None = None) -> list[str]:
-    """Lines that say what was understood of a `Sensor`; more of them with its `Reconstructor` and rest frame."""
+    """Return lines that describe a `Sensor`; its `Reconstructor` and rest frame add further lines."""
     lines = {
         "sensor": [f"{sensor.name!r}, fingerprint {sensor.fingerprint[:12]}, lengths in {sensor.length_unit}"],
         "camera": _views(sensor) or _camera(sensor.camera, sensor.length_unit),
@@ -76,7 +76,7 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
 
 
 def _range(sensor: Sensor) -> str:
-    """The limits of the sensor's answers, and where they come from."""
+    """Return the limits within which the sensor's results are valid, and their source."""
     own = sensor.range.for_fingerprint(sensor.fingerprint)
     size, unit = sensor.membrane.size, sensor.length_unit
     limits = f"up to {own.depth * size:.3g} {unit} deep, the surface turned by {own.turn:.3g} degrees"
@@ -105,7 +105,7 @@ def _camera(camera: Camera, unit: str) -> list[str]:
 
 
 def _views(sensor: Sensor) -> list[str]:
-    """Of several views each one's camera, place and what it sees at rest; none of one."""
+    """Return, for a sensor of several views, lines on each view's camera, position and visible part of the rest surface."""
     lines = []
     for number, view in enumerate(sensor.views):
         rotation, mirror = view.pose.rotation, "by a mirror, " * (view.pose.determinant < 0)
@@ -126,7 +126,7 @@ def _mode(mode: Mode) -> str:
 
 
 def _opening(camera: Camera, axis: int) -> float:
-    """Degrees seen along the image's row (axis 0) or column (axis 1) through the centre."""
+    """Return the angle of view through the image centre along a row (axis 0) or column (axis 1), degrees."""
     pixels = camera.centre.repeat(401, 1)
     pixels[:, axis] = torch.linspace(-0.5, camera.image_size[axis] - 0.5, 401, dtype=pixels.dtype)
     direction = camera.pixel_to_ray(pixels).direction.numpy()
@@ -147,7 +147,7 @@ def _membrane(sensor: Sensor) -> list[str]:
 
 
 def _sheet(sensor: Sensor) -> list[str]:
-    """Of an inflated surface: what is known of its equilibrium."""
+    """Return lines on the equilibrium of an inflated surface."""
     surface, energy = sensor.surface, elastic_energy(sensor, sensor.membrane)
     if not isinstance(surface, InflatedSurface) or not isinstance(energy, SheetEnergy):
         return []
@@ -225,13 +225,13 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
 
 
 def _extent(values: np.ndarray) -> str:
-    """The least and the largest value, or the one that all are."""
+    """Return the smallest and the largest value, or the single value if all are equal."""
     low, high = values.min(), values.max()
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _of_views(sensor: Sensor, reconstructor: Reconstructor, frame: Frame) -> list[str]:
-    """How many markers are found in each view's rest image, and how far from where the model has them."""
+    """Return lines on the markers found in each view's rest image, and their distance from the model's markers."""
     observer, lines = reconstructor.observer, []
     measured = observer.by_view(observer.measured_rest[None])[0]
     off = torch.linalg.vector_norm(measured - reconstructor.rest_pixels, dim=-1).cpu().numpy()

@@ -1,4 +1,4 @@
-"""What `torchmembrane init` does: from its options to a sensor, and its file with words."""
+"""The work of `torchmembrane init`: from options to a sensor and its commented file."""
 
 from argparse import Namespace
 from typing import Any, NamedTuple
@@ -31,14 +31,14 @@ LENGTHS = ("radius", "height", "semi_axes", "length", "half_angle", "size", "cor
 
 
 class Optics(NamedTuple):
-    """The camera, and its distance from the rim's plane; None where the rim itself is in the camera's frame."""
+    """The camera, and its distance from the rim's plane; None if the rim is given in the camera's frame."""
 
     camera: Camera
     distance: float | None
 
 
 def needed(arguments: Namespace) -> list[str]:
-    """The options that are still to be given."""
+    """Return the names of the required options that are missing."""
     lens = arguments.focal or arguments.view
     wanted = [*SHAPES[arguments.shape]]
     if arguments.rest is None:
@@ -53,7 +53,7 @@ def needed(arguments: Namespace) -> list[str]:
 
 
 def in_unit(length: float, unit: str | None, *, wanted: str) -> float:
-    """A length given in one unit in another; without a unit it is in that already.
+    """Convert a length from one unit to another; a length without a unit is already in the wanted unit.
 
     Example:
         >>> in_unit(0.6, "cm", wanted="mm")
@@ -63,12 +63,12 @@ def in_unit(length: float, unit: str | None, *, wanted: str) -> float:
 
 
 def _rim_in_space(arguments: Namespace) -> bool:
-    """Whether the rim's file has its points' z, in the camera's frame where no distance is given."""
+    """Return whether the rim file gives z as well; without a distance, its points are in the camera's frame."""
     return arguments.outline is not None and read_rim(arguments.outline).shape[1] == 3
 
 
 def write_draft(arguments: Namespace) -> list[str]:
-    """Write the sensor that the arguments describe; returns what was made, assumed and derived, in lines."""
+    """Write the sensor that the arguments describe; return lines on what was written, assumed and derived."""
     rest = None if arguments.rest is None else read_image(arguments.rest, bits=arguments.bits)
     seen = _rim_in_words(arguments, rest) if arguments.rim == FROM_IMAGE and rest is not None else []
     camera, distance = _optics(arguments, rest)
@@ -102,7 +102,7 @@ def write_draft(arguments: Namespace) -> list[str]:
 
 
 def _sheet(arguments: Namespace, distance: float | None) -> BlownUp:
-    """The sheet that is blown up in the rim that the arguments describe."""
+    """Return the sheet that is inflated in the rim that the arguments describe."""
     rim: dict[str, Any] = {"outline": arguments.shape}
     if arguments.outline is not None:
         rim["outline"] = read_rim(arguments.outline)
@@ -115,7 +115,7 @@ def _sheet(arguments: Namespace, distance: float | None) -> BlownUp:
 
 
 def refuse_foreign(arguments: Namespace) -> None:
-    """Refuse lengths of other shapes, and two answers to one question."""
+    """Refuse lengths that belong to other shapes, and redundant options."""
     more = {"half_cylinder": "half_angle", "rectangle": "corner"}
     allowed = {*SHAPES[arguments.shape], more.get(arguments.shape)}
     for name in LENGTHS:
@@ -154,7 +154,7 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
 
 
 def _rim_in_words(arguments: Namespace, rest: np.ndarray) -> list[str]:
-    """Put the rim's circle, as found in the rest image, in the place of `FROM_IMAGE`; returns what was found."""
+    """Replace `FROM_IMAGE` by the circle of the rim found in the rest image; return lines on what was found."""
     rim = find_rim(rest, find_dots(rest, arguments.polarity).pixels)
     (u, v), (longer, shorter) = rim.centre, rim.half_axes
     if shorter < ROUND * longer:
@@ -181,7 +181,7 @@ def _markers(arguments: Namespace, rest: np.ndarray | None, surface: Surface, ca
 
 
 def _dots_in_words(sensor: Sensor) -> list[str]:
-    """How many dots there are, and how many of them the rest image shows; refused where the camera sees hardly any."""
+    """Return lines on the number of dots and how many are in view or found at rest; refuse too few dots in view."""
     listed = sensor.markers.positions
     if sensor.markers.rest_image is None and listed is not None:
         seen = int(in_view(sensor.camera.point_to_pixel(torch.from_numpy(listed)).numpy(), sensor.camera.image_size).sum())

@@ -1,4 +1,4 @@
-"""Several views in a drafted sensor: where each camera stands, roughly, and what its rest image says of that."""
+"""Several views in a drafted sensor: the approximate camera poses, refined with the rest images."""
 
 from argparse import Namespace
 from dataclasses import replace
@@ -20,18 +20,20 @@ from ..sensor.views import View
 from .arguments import vector
 
 UPRIGHT = np.array([0.0, 1.0, 0.0])
-"""Downwards in the first view's image, and as near to that as can be in the others'."""
+"""Approximate direction "down" of all images, which is exact in the first view's image."""
 
 
 def with_views(sensor: Sensor, arguments: Namespace) -> tuple[Sensor, list[str]]:
-    """A drafted sensor with several views, and what was found of them, in lines.
+    """Add the views to a drafted sensor; return the sensor and lines on what was found.
 
     Args:
-        sensor: of the first view.
-        arguments: of the command: `views`, the first one's name and NAME=X,Y,Z of the others; `rest`, the first one's image.
+        sensor: drafted sensor of the first view.
+        arguments: arguments of the command: `views`, the name of the first view and NAME=X,Y,Z of the others; `rest`, the first
+            view's image.
 
     Raises:
-        MembraneError: fewer than two views, one without a place, a rest image that is missing or does not show the dots.
+        MembraneError: there are fewer than two views, a view has no position, or a rest image is missing or does not show the
+            dots.
     """
     first, *others = arguments.views
     places = dict(text.partition("=")[::2] for text in others)
@@ -62,7 +64,7 @@ def with_views(sensor: Sensor, arguments: Namespace) -> tuple[Sensor, list[str]]
 
 
 def looking_at(point: np.ndarray, place: np.ndarray) -> ViewPose:
-    """The pose of a camera at a place that looks at a point, its image as upright as can be.
+    """Return the pose of a camera at `place` that looks at `point`, with its image as upright as possible.
 
     Example:
         >>> pose = looking_at(np.array([0.0, 0.0, 40.0]), np.array([30.0, 0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""`torchmembrane export`: image to result as one ONNX model."""
+"""`torchmembrane export`: write the computation from image to result as one ONNX model."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -23,7 +23,7 @@ exit code: 0 written, 2 wrong usage or sensor file"""
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "export", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
@@ -33,7 +33,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Write the model; returns the exit code."""
+    """Write the model; return the exit code."""
     announce("export")
     from ..errors import MembraneError
     from ..files.targets import refuse_overwriting

@@ -1,4 +1,4 @@
-"""Results of a folder drawn as a film: `view --video-out`, `reconstruct --video-out`."""
+"""Films and contact sheets of the results in a folder: `view --video-out`, `reconstruct --video-out`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
 DEFAULT_RATE = 10.0
 """Frames per second."""
 MOST_FRAMES = 100
-"""On a sheet: of more, as many are chosen evenly."""
+"""Largest number of frames on a sheet; of more frames, as many are chosen evenly."""
 
 
 class FrameImages:
     """The images of frames, by name.
 
     Args:
-        files: of those that there are.
-        mesh: of the results, which says how large they must be, and which part of them the first view is.
-        bits: bits of the camera, where it is known that 16-bit files hold fewer.
+        files: the existing image files, by frame name.
+        mesh: mesh of the results, which gives the image size and the part that the first view sees.
+        bits: bit depth of the camera, if 16-bit files are known to use fewer bits.
     """
 
     def __init__(self, files: Mapping[str, Path], mesh: "Mesh", bits: int | None = None):
         self.files, self.mesh, self.bits = files, mesh, bits
 
     def named(self, name: str) -> "np.ndarray | None":
-        """Grey values `[height, width]` in 0..1, of several views the first one's; or None."""
+        """Return grey values `[height, width]` in 0..1, for several views those of the first; None if there is no image."""
         from ..files.images import read_image
 
         if name not in self.files:
@@ -38,7 +38,7 @@ class FrameImages:
 
 
 def images_in(folder: Path) -> dict[str, Path]:
-    """The image files of a folder by the names of their frames; none if there is no such folder."""
+    """Return the image files of a folder by the names of their frames; empty if there is no such folder."""
     from ..files.system_files import is_hidden
     from ..jobs.inputs import IMAGES, frame_name
 
@@ -47,7 +47,7 @@ def images_in(folder: Path) -> dict[str, Path]:
 
 
 def draw_film(results: "Results", images: FrameImages, path: Path, rate: float = DEFAULT_RATE) -> None:
-    """Draw all frames, in name order, and say so."""
+    """Draw all frames as a film, in name order, and print the path."""
     from tqdm import tqdm
 
     from ..plot.film import check_film, picture_of, write_film
@@ -62,7 +62,7 @@ def draw_film(results: "Results", images: FrameImages, path: Path, rate: float =
 
 
 def draw_sheet(results: "Results", images: FrameImages, path: Path) -> None:
-    """Draw all frames, or `MOST_FRAMES` of them, small on one sheet, and say so."""
+    """Draw all frames, or `MOST_FRAMES` of them, in small size on one sheet, and print the path."""
     from ..files.order import evenly
     from ..plot.files import save
     from ..plot.sheet import sheet_figure

@@ -1,4 +1,4 @@
-"""`torchmembrane init`: a commented sensor file from a few numbers, given as options or asked for."""
+"""`torchmembrane init`: write a commented sensor file from a few numbers, given as options or entered when asked."""
 
 import sys
 from argparse import ArgumentTypeError, Namespace
@@ -49,7 +49,7 @@ SENSOR.toml's files are written beside it. Next: torchmembrane check SENSOR.toml
 
 exit code: 0 written, 2 wrong usage"""
 ARRAYS = ("heightfield", "grid")
-"""What the file takes of other surfaces, which are given as arrays."""
+"""Shape names in the sensor file for other surfaces, which are given as arrays."""
 
 
 def _shape(text: str) -> str:
@@ -64,7 +64,7 @@ def _shape(text: str) -> str:
 
 
 def _length(text: str) -> tuple[float, str | None]:
-    """A positive length, and its unit where that follows the number."""
+    """Return a positive length, and its unit if one follows the number."""
     unit = next((unit for unit in sorted(LENGTH_UNITS, key=len, reverse=True) if text.endswith(unit)), None)
     return positive(text.removesuffix(unit or "")), unit
 
@@ -82,7 +82,7 @@ QUESTIONS = {
     "view": ("field of view across the image's width, degrees", positive),
     "distance": ("distance from the camera's pinhole to the rim's plane", _distance),
 }
-"""What is asked for on a terminal, and the type of the answer."""
+"""Questions asked on a terminal, and the types of the answers."""
 INSTEAD = {
     "distance": "; or --rim, the rim's circle in the rest image, with --view or --focal, which give it",
     "view": "; or --focal, px; or --rim with --distance, which give it",
@@ -90,7 +90,7 @@ INSTEAD = {
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "init", run, PURPOSE, EXAMPLES)
     add("sensor", metavar="SENSOR.toml", type=Path, help="the file to write")
     add("--name", help="name of the sensor (default: the name of the file)")
@@ -188,7 +188,7 @@ def _rim(text: str) -> list[float] | str:
 
 
 def run(arguments: Namespace) -> int:
-    """Write the file; returns the exit code."""
+    """Write the file; return the exit code."""
     path: Path = arguments.sensor
     if path.suffix != ".toml":
         raise MembraneError(f"init {path}: expected a file that ends with .toml, as sensor.toml")
@@ -214,7 +214,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _asked(name: str, question: str, kind: Callable[[str], Any]) -> Any:
-    """An answer from the terminal; without one, the option that is missing is named."""
+    """Return an answer from the terminal; if there is no answer, raise an error that names the missing option."""
     option = f"--{name.replace('_', '-')}"
     if not sys.stdin.isatty():
         raise MembraneError(f"init: {option} is missing; expected the {question}{INSTEAD.get(name, '')}")

@@ -1,4 +1,4 @@
-"""`torchmembrane live`: reconstruct the frames of a camera, or of a recording played like one, as they come."""
+"""`torchmembrane live`: reconstruct the frames of a camera, or of a recording played like one, as they arrive."""
 
 import signal
 import sys
@@ -61,11 +61,11 @@ MODULUS = (
 SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
 DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
-"""Defaults of options that torch uses as well."""
+"""Defaults of the options that apply to torch only."""
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "live", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     opened = "a camera, by OpenCV: its number, 0 the first, or its path or address; of several views one each, named"
@@ -89,7 +89,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Follow the source until it ends or is stopped; returns the exit code."""
+    """Reconstruct the frames of the source until it ends or is stopped; return the exit code."""
     from ..interruption import answer
     from ..live.line import StatusLine, summary
     from ..live.loop import StreamStats, follow
@@ -145,7 +145,7 @@ def _check(arguments: Namespace) -> None:
 
 
 def _spare_files(arguments: Namespace) -> None:
-    """Refuse to write the recording of Rerun over a file."""
+    """Refuse to overwrite a file with the Rerun recording."""
     from ..files.targets import refuse_overwriting
     from ..presets import sensor_file
     from ..sensor.companions import files_of
@@ -177,7 +177,7 @@ def _images(arguments: Namespace, sensor: "Sensor") -> "Iterator[Captured]":
 
 
 def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
-    """What computes."""
+    """Return the stream that computes the results."""
     from dataclasses import replace
 
     import torch
@@ -197,7 +197,7 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
 def _watchers(
     arguments: Namespace, stream: "Stream", sensor: "Sensor", stack: ExitStack, said: "list[Callable[[], str]]"
 ) -> "list[Callable[[LiveFrame, StreamStats], None]]":
-    """What else is given the frames; to `said` is added what tells of it in the end."""
+    """Return the other consumers of the frames; to `said`, add functions that report on them at the end."""
     from ..integrations.rerun import RerunLog
     from ..live.recording import Recording
     from ..sensor.view_images import first_view_picture
@@ -233,7 +233,8 @@ def _left_out(later: "Background[LiveFrame]") -> str:
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[Event]:
-    """An event that the first SIGINT or SIGTERM sets; the second, or a frame that takes too long, ends the command as ever."""
+    """Yield an event that the first SIGINT or SIGTERM sets; a second signal, or a frame that takes too long, ends the
+    command."""
     stop = Event()
     before: dict[signal.Signals, Any] = {}
 
@@ -252,7 +253,7 @@ def _stopped_by_signals() -> Iterator[Event]:
 
 
 def _requests_by_keys(length_unit: str) -> "deque[Request]":
-    """What lines of the standard input ask for."""
+    """Return a queue of the requests that are typed on the standard input."""
     requests: deque[Request] = deque()
 
     def read() -> None:
@@ -265,7 +266,8 @@ def _requests_by_keys(length_unit: str) -> "deque[Request]":
 
 
 def request_of(text: str, length_unit: str) -> "Request":
-    """The request of a typed line: `z`, a weight or a reading of a gauge; the answer to any other line is what is expected.
+    """Return the request of a typed line: `z`, a weight or a gauge reading; for any other line, a request that returns the
+    expected input.
 
     Example:
         >>> request_of("q", "mm")(None)

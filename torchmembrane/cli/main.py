@@ -1,6 +1,6 @@
-"""The command `torchmembrane`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130 interrupted, 143 by SIGTERM.
+"""The command `torchmembrane`. Exit codes: 0 success, 1 some frames failed, 2 wrong usage, 130 interrupted, 143 by SIGTERM.
 
-Each command has a module of its own, with its parser, which loads nothing heavy, and `run`, which loads what it needs.
+Each command has its own module, with a parser that loads nothing heavy, and with `run`, which loads what it needs.
 """
 
 import atexit
@@ -20,7 +20,7 @@ COMMANDS = (init, check, capture, reconstruct, live, view, calibrate, simulate, 
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command with these arguments (default: the process's); returns the exit code."""
+    """Run the command with these arguments (default: those of the process); return the exit code."""
     with warnings.catch_warnings(), ended_by_signals() as interrupted_by:
         warnings.showwarning = lambda message, *_: print(f"torchmembrane: warning: {message}", file=sys.stderr)
         try:
@@ -47,13 +47,13 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _said(error: MembraneError | OSError) -> str:
-    """What an error says; of files all name theirs, so that one without a name is of the standard output."""
+    """Return the message of an error; file errors name their file, so an error without a name is one of the standard output."""
     nameless = isinstance(error, OSError) and error.filename is None and error.errno is not None
     return f"standard output: {error}" if nameless else str(error)
 
 
 def command_parser() -> ArgumentParser:
-    """The parser of the whole command."""
+    """Return the parser of the whole command."""
     parser = CommandParser(
         prog="torchmembrane", description="3-D shape of a deformable membrane from one image of its markings."
     )

@@ -1,4 +1,4 @@
-"""The parser of every command: wrong arguments are answered in two lines, with what was probably meant."""
+"""The parser of every command: wrong arguments get a two-line answer with a suggestion of what was probably meant."""
 
 import re
 import sys
@@ -8,7 +8,7 @@ from typing import NoReturn
 
 
 class CommandParser(ArgumentParser):
-    """An `ArgumentParser` that takes `--direction -0.5,0,0.87` for a value, and answers for its own unknown options.
+    """An `ArgumentParser` that accepts `--direction -0.5,0,0.87` as a value, and reports unknown options of its own command.
 
     Example:
         >>> parser = CommandParser(prog="p")
@@ -20,14 +20,14 @@ class CommandParser(ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Namespace | None = None
     ) -> tuple[Namespace, list[str]]:
-        """As of `ArgumentParser`, but nothing is left over: unknown arguments are refused here, where the options are known."""
+        """Parse as `ArgumentParser` does, but refuse unknown arguments here, where the options of the command are known."""
         parsed, unknown = super().parse_known_args(negative_joined(sys.argv[1:] if args is None else args), namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return parsed, []
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong, where all arguments are listed, and what was probably meant; exit with 2."""
+        """Print what is wrong, where the arguments are listed, and what was probably meant; exit with status 2."""
         self.exit(2, f"usage: {self.prog} --help lists all arguments\n{self.prog}: error: {message}{self._meant(message)}\n")
 
     def _meant(self, message: str) -> str:
@@ -47,7 +47,8 @@ def _appended(question: str) -> str:
 
 
 def negative_joined(arguments: Sequence[str]) -> list[str]:
-    """Arguments with what begins with a minus and a digit joined to the option before: it is its value, no option.
+    """Return the arguments with each one that begins with a minus sign and a digit joined to the option before it, as its
+    value.
 
     Example:
         >>> negative_joined(["--direction", "-0.5,0,1", "-v", "a.png"])

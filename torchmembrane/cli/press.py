@@ -1,4 +1,4 @@
-"""What `torchmembrane simulate` does: one press, the frames along a path, or a data set of random presses."""
+"""The work of `torchmembrane simulate`: one press, the frames along a path, or a data set of random presses."""
 
 import math
 from argparse import Namespace
@@ -33,13 +33,13 @@ LENGTHS = {
     "aim": (0.0, 100.0),
     "increment": (1e-4, 2.0),
 }
-"""Least and greatest over the surface's size."""
+"""Smallest and largest lengths relative to the size of the surface."""
 OUTWARDS = 0.3
-"""Cosine between a press and the outward normal where it first touches, from which on it comes from within."""
+"""Cosine between the travel and the outward normal at the first touch above which the press comes from within."""
 
 
 def simulate(arguments: Namespace) -> int:
-    """Simulate what the arguments ask for; returns the exit code."""
+    """Simulate what the arguments specify; return the exit code."""
     torch.set_num_threads(1)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     if arguments.video and sensor.views_apart:
@@ -57,7 +57,7 @@ def simulate(arguments: Namespace) -> int:
 
 
 def _spare_files(arguments: Namespace, views: Sequence[str]) -> None:
-    """Refuse a folder in which files would be lost; a frame of an earlier simulation in it is made anew."""
+    """Refuse a folder in which files would be lost; frames of an earlier simulation in it are replaced."""
     out, read = arguments.out, files_of(sensor_file(arguments.sensor))
     is_known = (out / SETTINGS).exists()
     targets = [] if is_known or (out / SENSOR).exists() else [out / SETTINGS, *companions_of(out / SENSOR)]
@@ -77,7 +77,7 @@ def _spare_files(arguments: Namespace, views: Sequence[str]) -> None:
 
 
 def _numbered(name: str, number: int) -> str:
-    """The name of a frame of a path."""
+    """Return the name of a frame of a path."""
     return f"{name}_{number:06d}"
 
 
@@ -130,7 +130,7 @@ def _film(arguments: Namespace, simulator: Simulator, stroke: Stroke) -> int:
 
 
 def _refuse_lengths(arguments: Namespace, size: float) -> None:
-    """Refuse lengths that no press of a surface of this size can have, by the option."""
+    """Refuse lengths that are impossible for a press of a surface of this size; the message names the option."""
     for name, (least, most) in LENGTHS.items():
         if (value := getattr(arguments, name)) is None:
             continue

@@ -1,4 +1,4 @@
-"""How far a long command is and how much time is left: a bar on a terminal, lines every few seconds elsewhere. On stderr."""
+"""Progress and remaining time of a long command, on stderr: a bar on a terminal, a line every few seconds elsewhere."""
 
 import sys
 from time import monotonic
@@ -6,24 +6,24 @@ from types import TracebackType
 from typing import Any
 
 LINE_SECONDS = 5.0
-"""Between two lines where stderr is no terminal."""
+"""Seconds between two lines if stderr is not a terminal."""
 FEWEST_STEPS = 2
-"""Fewest steps for a rate: parallel processes end several steps at once, and then none for a while."""
+"""Smallest number of steps for a rate: parallel processes may finish several steps at once, and then none for a while."""
 LEAST_DONE = 0.1
-"""Share of the work after which the rate since its beginning counts, because processes may have had to start."""
+"""Share of work from which on the rate since the beginning is used, because processes may have had to start."""
 
 
 def announce(title: str) -> None:
-    """Say that a command has begun, before packages are loaded that take seconds.
+    """Print that a command has started, before packages are loaded that take seconds.
 
     Args:
-        title: title of the command, as `calibrate material`.
+        title: title of the command, such as `calibrate material`.
     """
     print(f"{title}: loading packages", file=sys.stderr, flush=True)
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words, to two digits or so.
+    """Return seconds in words, rounded to about two digits.
 
     Example:
         >>> [duration(seconds) for seconds in (0.4, 41.7, 100, 7260)]
@@ -36,10 +36,11 @@ def duration(seconds: float) -> str:
 
 
 class ProgressDisplay:
-    """Shows what a computation tells of its progress; the object is the computation's `progress`.
+    """Display of a computation's progress; the object is passed as the computation's `progress`.
 
-    The time left is by the rate of the latter half of the work done since the first call, of `FEWEST_STEPS` at least: what only
-    the beginning takes, other processes to start or code to compile, is soon forgotten.
+    The remaining time is estimated from the rate over the later half of the work done since the first call, at least
+    `FEWEST_STEPS` steps: one-time costs at the beginning, such as starting processes or compiling code, soon lose their
+    influence.
 
     Args:
         title: title of the command.
@@ -69,11 +70,11 @@ class ProgressDisplay:
             self.bar.close()
 
     def begin(self, step: str) -> None:
-        """Show what comes before the work whose share is told."""
+        """Show a step that precedes the measured work."""
         self._show(0.0, step, None)
 
     def __call__(self, share: float, step: str) -> None:
-        """Show that a share of the work, 0..1, is done, and the step that begins."""
+        """Show that a share of the work, 0..1, is done, and which step begins."""
         self._show(share, step, self.time_left(share, monotonic()))
 
     def _show(self, share: float, step: str, left: float | None) -> None:
@@ -86,11 +87,11 @@ class ProgressDisplay:
             self.said = monotonic()
 
     def time_left(self, share: float, now: float) -> float | None:
-        """Seconds until all is done; None until there is a rate to tell it by.
+        """Return the estimated seconds until all work is done; None until there is a rate.
 
         Args:
-            share: share of the work that is done.
-            now: seconds, of any clock; the first call begins.
+            share: share of the work that is done, 0..1.
+            now: current time of any clock in seconds; the first call starts the measurement.
         """
         self.told.append((share, now))
         first = self.told[0][0]
@@ -105,7 +106,7 @@ class ProgressDisplay:
         return (now - at) * (1 - share) / (share - done)
 
     def write(self, line: str) -> None:
-        """Write a line of its own, above the bar where there is one."""
+        """Write a separate line, above the bar if there is one."""
         if self.bar is not None:
             self.bar.write(line, file=sys.stderr)
         else:

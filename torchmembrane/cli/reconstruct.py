@@ -1,4 +1,4 @@
-"""`torchmembrane reconstruct`: images or a video to a folder of results."""
+"""`torchmembrane reconstruct`: reconstruct images or videos into a folder of results."""
 
 import sys
 from argparse import Namespace
@@ -52,7 +52,7 @@ exit code: 0 all well, 1 some frames failed (see stderr and summary.csv), 2 wron
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "reconstruct", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, videos, or bags")
@@ -94,7 +94,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Reconstruct; returns the exit code."""
+    """Reconstruct; return the exit code."""
     from ..files.folder_lock import Shard
     from ..jobs.bags import bag_remarks, result_bag, write_bag
     from ..jobs.inputs import frame_name
@@ -146,7 +146,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _inputs(arguments: Namespace, views: "list[str]") -> "Inputs":
-    """What is to be reconstructed; of several views what there is of the first one."""
+    """Return the inputs to reconstruct; for several views, the files of the first view."""
     from ..jobs.inputs import find_inputs, of_first_view, without_rest
     from ..presets import sensor_file
     from ..sensor.companions import files_of
@@ -161,7 +161,7 @@ def _inputs(arguments: Namespace, views: "list[str]") -> "Inputs":
 
 
 def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str) -> "Settings":
-    """The settings of the results."""
+    """Return the settings of the results."""
     from ..results.store import Settings
 
     fields = sorted(set(arguments.fields), key=FIELDS.index)
@@ -170,7 +170,7 @@ def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str)
 
 
 def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":
-    """What a gauge's log says of the frames; unused readings are counted."""
+    """Return a gauge's readings of the frames; report the number of unused readings."""
     from ..jobs.pressure import recording_pressures
 
     readings = recording_pressures(reconstructor, log, inputs)
@@ -180,7 +180,7 @@ def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "
 
 
 def _check(arguments: Namespace) -> None:
-    """Refuse options that cannot be together, or not on this machine, before anything is read."""
+    """Refuse options that exclude each other or are impossible on this machine, before anything is read."""
     from ..errors import MembraneError
 
     if arguments.engine == "local":
@@ -196,7 +196,7 @@ def _check(arguments: Namespace) -> None:
 
 
 def _spare_files(arguments: Namespace, inputs: "Inputs") -> None:
-    """Refuse to write over files other than those of the results that this call continues."""
+    """Refuse to overwrite files other than the results that this call continues."""
     from functools import partial
 
     from ..files.targets import refuse_overwriting

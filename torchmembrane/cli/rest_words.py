@@ -1,4 +1,4 @@
-"""What `check` says of a rest surface: whether it can be at rest, what a gauge says of it, and what either does to forces."""
+"""What `check` reports on a rest surface: whether it is an equilibrium, how a gauge reading fits, and the effect on forces."""
 
 from ..accuracy.rest_shape import NearestSheet, RestShape, rest_shape
 from ..sensor.sensor import Sensor
@@ -11,10 +11,10 @@ FAR = 0.003  # rms distance from the nearest sheet, over the surface's size: abo
 
 
 def rest_in_words(sensor: Sensor, gauge: float | None = None) -> list[str]:
-    """Lines about a sensor's rest surface.
+    """Return lines about a sensor's rest surface.
 
     Args:
-        sensor: any.
+        sensor: any sensor.
         gauge: overpressure measured at rest, hPa.
     """
     shape = rest_shape(sensor)

@@ -1,4 +1,4 @@
-"""A sensor's spec sheet in words."""
+"""The spec sheet of a sensor in words."""
 
 from collections.abc import Iterator
 from math import isfinite
@@ -7,11 +7,11 @@ from statistics import median
 from ..accuracy.spec_sheet import CLOSE, LOST, SpecSheet, Spread
 
 LISTED = 4
-"""Trials left out that are named one by one."""
+"""Largest number of left-out trials that are listed individually."""
 
 
 def sheet_lines(sheet: SpecSheet) -> list[str]:
-    """Lines that say what to expect of a sensor."""
+    """Return lines on what to expect of a sensor."""
     blocks = {
         "accuracy": _conditions(sheet),
         "at rest": _rest(sheet),
@@ -98,13 +98,13 @@ def _deepest(sheet: SpecSheet) -> Iterator[str]:
 
 
 def units(sheet: SpecSheet) -> tuple[str, str]:
-    """Of forces and of pressures."""
+    """Return the units of forces and pressures."""
     relative = sheet.force_unit == "relative"
     return ("relative",) * 2 if relative else (sheet.force_unit, f"{sheet.force_unit}/{sheet.length_unit}²")
 
 
 def _number(value: float) -> str:
-    """Two digits, or all before the point.
+    """Format a number with two digits, or with all digits before the decimal point.
 
     >>> [_number(value) for value in (0.01234, 5.678, 123.4, 0.0, float("nan"))]
     ['0.012', '5.7', '123', '0', '-']

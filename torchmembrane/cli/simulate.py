@@ -1,4 +1,4 @@
-"""`torchmembrane simulate`: presses of a sensor's membrane and their images, with the truth."""
+"""`torchmembrane simulate`: simulate presses of a sensor's membrane, with images and ground truth."""
 
 import os
 from argparse import Namespace
@@ -60,7 +60,7 @@ exit code: 0 all well, 1 some presses of a data set failed, 2 wrong usage, or a 
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "simulate", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("--out", metavar="DIR", type=Path, required=True, help="folder of frames: new, or of the same sensor and appearance")
@@ -129,7 +129,7 @@ def _add_appearance(add: Add) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Simulate; returns the exit code."""
+    """Simulate; return the exit code."""
     _check_options(arguments)
     if arguments.random is not None:
         announce("simulate --random")
@@ -139,7 +139,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _check_options(arguments: Namespace) -> None:
-    """Refuse what would be passed over in silence."""
+    """Refuse options that would otherwise be ignored silently."""
 
     def given(*names: str) -> list[str]:
         return [name for name in names if getattr(arguments, name) is not None]

@@ -1,4 +1,4 @@
-"""`torchmembrane view`: stored results drawn, one as a figure, all of a folder as a film or in Rerun."""
+"""`torchmembrane view`: draw stored results, one as a figure, or all of a folder as a film or in Rerun."""
 
 import os
 import sys
@@ -31,7 +31,7 @@ Without --out a window is opened; without a display, NAME_view.png is written be
 
 
 def add_parser(commands: Any) -> None:
-    """Add the command's parser."""
+    """Add the parser of the command."""
     add = add_command(commands, "view", run, PURPOSE, EXAMPLES)
     what = "a frame's result NAME.npz, a part of a Parquet dataset, or a folder; with --plot several folders"
     add("result", metavar="RESULT", type=Path, nargs="+", help=what)
@@ -61,7 +61,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: Namespace) -> int:
-    """Draw the results; returns the exit code."""
+    """Draw the results; return the exit code."""
     from ..files.order import warn_of_times
     from ..live.recording import times_of
     from ..results.read import read_results
@@ -96,7 +96,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _spare_files(arguments: Namespace, folders: list[Path], *targets: Path | None) -> None:
-    """Refuse to write over files, those of earlier drawings excepted."""
+    """Refuse to overwrite files other than earlier drawings."""
     from functools import partial
 
     from ..files.targets import refuse_overwriting
@@ -111,7 +111,7 @@ def _spare_files(arguments: Namespace, folders: list[Path], *targets: Path | Non
 
 
 def _plot(folders: list[Path], path: Path) -> None:
-    """Draw the tables of folders over time, and say so."""
+    """Draw the tables of folders over time, and print the path."""
     from ..plot.files import save
     from ..plot.series import series_figure
     from ..results.summary import read_summary

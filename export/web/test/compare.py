@@ -1,4 +1,4 @@
-"""Two results of one image: python export/web/test/compare.py SAVED.npz EXPECTED.npz; says how far they differ as JSON."""
+"""Print as JSON how far two results of one image differ: python export/web/test/compare.py SAVED.npz EXPECTED.npz."""
 
 import json
 import sys

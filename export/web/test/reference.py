@@ -1,4 +1,4 @@
-"""What the page is tested with and against: images, models, and what Python makes of them.
+"""Write the test inputs of the web page and the expected results: images, models, and their results in Python.
 
 python export/web/test/reference.py SENSOR.toml MODEL.onnx EXAMPLE.png... --tracking MODEL.onnx --out DIR
 """
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def images(example: Path, out: Path) -> None:
-    """Images that decoders may take for something else, with the grey values of `read_image` as .f32; unusable ones."""
+    """Write images that decoders may misinterpret, with the grey values of `read_image` as .f32, and unusable images."""
     grey = Image.open(example)
     linear = PngImagePlugin.PngInfo()
     linear.add(b"gAMA", struct.pack(">I", 100000))  # the values are light, not sRGB: a screen would show them brighter
@@ -73,7 +73,7 @@ def images(example: Path, out: Path) -> None:
 
 
 def sequences(picture: Image.Image, out: Path) -> None:
-    """Files of three pictures, and one of a picture with a preview."""
+    """Write files of three pictures, and a file of one picture with a preview."""
     others = [Image.eval(picture, lambda value: 255 - value), picture]
     for name, kind in {"png": "PNG", "gif": "GIF", "webp": "WEBP", "jpg": "MPO"}.items():
         picture.save(out / f"sequence.{name}", kind, save_all=True, append_images=others)
@@ -81,7 +81,8 @@ def sequences(picture: Image.Image, out: Path) -> None:
 
 
 def models(path: Path, out: Path) -> None:
-    """The model under another name, with what it says of its sensor damaged, and what no `torchmembrane export` wrote."""
+    """Write copies of the model: under another name, with damaged sensor metadata, and as no `torchmembrane export` writes
+    it."""
     model = onnx.load(path)
     known = {entry.key: entry.value for entry in model.metadata_props}
     mesh = json.loads(known["mesh"])

@@ -1,6 +1,6 @@
-"""A membrane's camera for LeRobot, what it feels as observations, and data sets with what was felt.
+"""A membrane's camera for LeRobot, its tactile results as observations, and data sets with tactile results.
 
-`convert` and `add` import what LeRobot's extra `dataset` brings; everything else does without.
+`convert` and `add` need LeRobot's extra `dataset`; the other modules do not.
 """
 
 from .versions import refuse_untested

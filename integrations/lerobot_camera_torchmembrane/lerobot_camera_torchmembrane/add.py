@@ -1,4 +1,4 @@
-"""Wrenches, contacts and statuses for a data set that was recorded with images alone."""
+"""Addition of wrenches, contacts and statuses to a data set that was recorded with images only."""
 
 from pathlib import Path
 
@@ -17,21 +17,21 @@ from .convert import refuse_existing
 
 
 def add(root: Path, sensors: dict[str, Path], out: Path, repo_id: str) -> LeRobotDataset:
-    """Write a data set anew, with what the membranes of its cameras felt.
+    """Write a new data set that adds the tactile results of its cameras' membranes.
 
     Args:
-        root: the data set's folder; it stays as it is.
-        sensors: sensor files by the name of their camera: of images `observation.images.NAME` come
+        root: folder of the data set, which is not changed.
+        sensors: sensor files by the name of their camera: images `observation.images.NAME` yield
             `observation.tactile.NAME.wrench`, `.contacts` and `.status`.
-        out: the new data set's folder, which must not exist.
-        repo_id: its name, `owner/name`.
+        out: folder of the new data set, which must not exist.
+        repo_id: name of the new data set, `owner/name`.
 
     Returns:
-        The new data set, statistics included.
+        The new data set, including statistics.
 
     Raises:
-        MembraneError: there is no data set, or something at `out`, a camera is none of the data set's or of another size than
-            its sensor file's, or what is to be added is there.
+        MembraneError: `root` holds no data set, `out` exists, a camera is not in the data set or has another size than in its
+            sensor file, or the data set already has the features to be added.
     """
     if not (root / "meta/info.json").is_file():
         raise tm.MembraneError(f"{root}: no data set of LeRobot (meta/info.json is missing); expected its folder")
@@ -49,7 +49,7 @@ def add(root: Path, sensors: dict[str, Path], out: Path, repo_id: str) -> LeRobo
 
 
 def refuse_camera(features: dict[str, dict], name: str, size: tuple[int, int]) -> None:
-    """Refuse a camera that the data set has not, whose size is another one, or that has what is to be added."""
+    """Refuse a camera that is not in the data set, has another image size, or already has the features to be added."""
     key = f"observation.images.{name}"
     if key not in features:
         images = "observation.images."
@@ -64,7 +64,7 @@ def refuse_camera(features: dict[str, dict], name: str, size: tuple[int, int]) -
 
 
 def felt_in(dataset: LeRobotDataset, trackers: dict[str, tm.Tracker]) -> dict[str, np.ndarray]:
-    """What was felt in all frames by key, `[N, ...]`; every episode starts from rest."""
+    """Return the tactile results of all frames by key, `[N, ...]`; every episode starts from the rest state."""
     values: dict[str, list[np.ndarray]] = {key: [] for name in trackers for key in tactile.features(name)}
     episode = None
     for item in tqdm((dataset[k] for k in range(len(dataset))), total=len(dataset), unit=" frames"):
@@ -79,7 +79,8 @@ def felt_in(dataset: LeRobotDataset, trackers: dict[str, tm.Tracker]) -> dict[st
 
 
 def keep_episode_statistics(dataset: LeRobotDataset, values: dict[str, np.ndarray], declared: dict[str, dict]) -> None:
-    """Write each episode's statistics of the new features beside the others: who deletes or merges episodes sums them up."""
+    """Write each episode's statistics of the new features beside the others, since deleting or merging episodes aggregates
+    them."""
     for path in sorted((dataset.root / "meta/episodes").glob("*/*.parquet")):
         table = pq.read_table(path)
         spans = list(zip(*(table[f"dataset_{end}_index"].to_pylist() for end in ("from", "to")), strict=True))

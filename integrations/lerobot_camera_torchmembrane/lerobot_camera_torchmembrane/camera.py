@@ -1,4 +1,4 @@
-"""The camera inside of a membrane, as LeRobot reads cameras."""
+"""The camera inside a membrane as a LeRobot camera."""
 
 import time
 
@@ -9,13 +9,13 @@ from lerobot.cameras.opencv import OpenCVCamera
 from .config import TorchMembraneCameraConfig
 
 FIRST_FRAME = 10.0
-"""Seconds in which a video's first frame must have come."""
+"""Seconds within which the first frame of a video must arrive."""
 
 
 class TorchMembraneCamera(OpenCVCamera):
-    """Frames `[height, width, 3]` uint8 of a membrane's camera: LeRobot's own OpenCV camera, which a video file may stand for.
+    """Frames `[height, width, 3]` uint8 of a membrane's camera, read by LeRobot's OpenCV camera; a video file may replace it.
 
-    A video's frames come at `fps` as a device's do, whether they are read or not, and begin again after the last one.
+    The frames of a video arrive at `fps` like those of a device, whether they are read or not, and restart after the last one.
 
     Args:
         config: a `TorchMembraneCameraConfig`.
@@ -29,11 +29,11 @@ class TorchMembraneCamera(OpenCVCamera):
         """Open the device or the video file, and wait for a first frame.
 
         Args:
-            warmup: whether a device is read for `warmup_s` seconds first; a video begins with its first frame.
+            warmup: whether to read a device for `warmup_s` seconds first; a video begins with its first frame.
 
         Raises:
-            DeviceAlreadyConnectedError: it is open.
-            ConnectionError: it cannot be opened, or gives no frame.
+            DeviceAlreadyConnectedError: the camera is already open.
+            ConnectionError: the camera cannot be opened, or delivers no frame.
         """
         super().connect(warmup and not self.config.is_video)
         if self.config.is_video and not self.new_frame_event.wait(FIRST_FRAME):

@@ -9,7 +9,7 @@ from torchmembrane import MembraneError
 
 
 def to_lerobot(arguments: list[str] | None = None) -> int:
-    """Folders of results as the episodes of a new data set."""
+    """Convert folders of results to the episodes of a new data set."""
     parser = argparse.ArgumentParser("torchmembrane-to-lerobot", description="Folders of results as a data set of LeRobot.")
     parser.add_argument("folders", nargs="+", type=Path, help="results of runs, an episode each")
     parser.add_argument("--root", required=True, type=Path, help="the data set's folder, new")
@@ -29,7 +29,7 @@ def to_lerobot(arguments: list[str] | None = None) -> int:
 
 
 def lerobot_add(arguments: list[str] | None = None) -> int:
-    """Wrenches, contacts and statuses for a recorded data set."""
+    """Add wrenches, contacts and statuses to a recorded data set."""
     parser = argparse.ArgumentParser(
         "torchmembrane-lerobot-add",
         description="A data set of LeRobot written anew with wrenches, contacts and statuses of the membranes in its images.",
@@ -56,7 +56,7 @@ def lerobot_add(arguments: list[str] | None = None) -> int:
 
 
 def finished(parser: argparse.ArgumentParser, run: Callable[[], str]) -> int:
-    """Print what a command says at its end; its exit code."""
+    """Run a command and print its final message; return the exit code."""
     try:
         print(run())
     except ImportError as error:  # LeRobot says which of its packages is missing

@@ -1,4 +1,4 @@
-"""What a membrane's camera is configured by."""
+"""Configuration of a membrane's camera."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +13,16 @@ from torchmembrane import MembraneError, Sensor
 @CameraConfig.register_subclass("torchmembrane")
 @dataclass(kw_only=True)
 class TorchMembraneCameraConfig(OpenCVCameraConfig):
-    """The camera inside of a membrane: LeRobot's OpenCV camera, of a sensor file's size.
+    """The camera inside a membrane: LeRobot's OpenCV camera with the image size of a sensor file.
 
     Args:
-        sensor: path of the sensor file, `sensor.toml`; width and height are its camera's.
-        index_or_path: index or path of the video device, as OpenCV takes it, or of a video file, whose own rate is the default
+        sensor: path of the sensor file, `sensor.toml`; width and height are taken from its camera.
+        index_or_path: index or path of the video device, as in OpenCV, or path of a video file, whose own rate is the default
             of `fps`.
 
     Raises:
-        MembraneError: the sensor file is wrong, or says another width or height; or a file is no video, or of another size.
+        MembraneError: the sensor file is invalid or has another width or height; or the file is not a video or has another
+            size.
     """
 
     sensor: str
@@ -29,7 +30,7 @@ class TorchMembraneCameraConfig(OpenCVCameraConfig):
 
     @property
     def is_video(self) -> bool:
-        """Whether frames come from a file."""
+        """Whether the frames come from a file."""
         return Path(str(self.index_or_path)).is_file()
 
     def __post_init__(self) -> None:
@@ -44,7 +45,7 @@ class TorchMembraneCameraConfig(OpenCVCameraConfig):
             self.fps = self.fps or rate
 
     def _check_video(self) -> int:
-        """Whole frames per second of the video file."""
+        """Check the video file and return its frame rate as a whole number."""
         video = cv2.VideoCapture(str(self.index_or_path))
         rate, *found = (video.get(what) for what in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         opened = video.isOpened()

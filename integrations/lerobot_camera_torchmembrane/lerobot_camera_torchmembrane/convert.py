@@ -1,4 +1,4 @@
-"""Recorded runs as LeRobot data sets (v3): a folder of results is an episode."""
+"""Conversion of recorded runs to LeRobot data sets (v3): each folder of results becomes an episode."""
 
 from pathlib import Path
 
@@ -14,18 +14,18 @@ def convert(folders: list[Path], root: Path, repo_id: str, name: str, fps: int, 
     """Write folders of results as the episodes of a new data set.
 
     Args:
-        folders: what `torchmembrane reconstruct` wrote, each a run, its frames in the order of their names.
-        root: the data set's folder, which must not exist.
-        repo_id: its name, `owner/name`.
+        folders: folders written by `torchmembrane reconstruct`, each a run with its frames in name order.
+        root: folder of the data set, which must not exist.
+        repo_id: name of the data set, `owner/name`.
         name: name of the sensor in the keys `observation.tactile.NAME.points`, `.wrench`, `.contacts` and `.status`.
         fps: frames per second of the runs.
-        task: what was done, in words.
+        task: description of the task.
 
     Returns:
-        The data set, read again.
+        The data set, loaded again from its folder.
 
     Raises:
-        MembraneError: a folder holds no results, the runs are of different grids or units, or there is something at `root`.
+        MembraneError: a folder holds no results, the runs have different grids or units, or `root` already exists.
     """
     runs = [tm.read_results(folder) for folder in folders]
     kinds = {(len(run.mesh.rest_vertices), run.mesh.length_unit, run.mesh.force_unit) for run in runs}
@@ -46,13 +46,13 @@ def convert(folders: list[Path], root: Path, repo_id: str, name: str, fps: int, 
 
 
 def refuse_existing(root: Path) -> None:
-    """Refuse to write a data set where something is."""
+    """Refuse to write a data set to an existing path."""
     if root.exists():
         raise tm.MembraneError(f"{root}: exists; expected the folder of a new data set: give another one")
 
 
 def vertex_areas(rest: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """A third of the area of the triangles around every vertex, `[V]`."""
+    """Return a third of the area of the triangles around every vertex, `[V]`."""
     a, b, c = (rest[triangles[:, k]] for k in range(3))
     third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     return np.bincount(triangles.ravel(), np.repeat(third, 3), len(rest))

@@ -1,4 +1,4 @@
-"""The step of a LeRobot pipeline that adds what a membrane feels to the observations."""
+"""A step of a LeRobot pipeline that adds a membrane's tactile results to the observations."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,22 +15,23 @@ from . import tactile
 @ProcessorStepRegistry.register(name="torchmembrane_tactile")
 @dataclass
 class TactileProcessorStep(ObservationProcessorStep):
-    """From the image of a membrane's camera to what it feels, in the form of the observations that the image is found in.
+    """Reconstruct the image of a membrane's camera, and add the results in the form of the observations that hold the image.
 
-    In a robot's observations the image is `NAME`, and plain numbers are added, `NAME.Fx` ... `NAME.Mz` and `NAME.status`, as
-    `record` of LeRobot writes them. In a policy's the image is `observation.images.NAME`, and tensors are added,
-    `observation.tactile.NAME.wrench [6]`, `.contacts [24]`, `.status [1]` and `.points [V, 6]`, with the image's batch of one.
+    In a robot's observations, the image is `NAME`, and plain numbers are added, `NAME.Fx` ... `NAME.Mz` and `NAME.status`,
+    which LeRobot's `record` writes. In a policy's observations, the image is `observation.images.NAME`, and tensors are added,
+    `observation.tactile.NAME.wrench [6]`, `.contacts [24]`, `.status [1]` and `.points [V, 6]`, with the image's batch axis of
+    size one.
 
     Args:
         sensor: path of the sensor file.
         name: name of the camera.
 
     Raises:
-        MembraneError: the sensor file is wrong, or an image is of another size, or missing.
+        MembraneError: the sensor file is invalid, or an image is missing or has another size.
 
     Limitations:
-        Frames without a surface give zeros; `status` tells. Frames are those of one stream; `reset()` starts anew.
-        Machine code is compiled when the step is made, which takes a minute or more after an installation.
+        Frames without a surface give zeros, which `status` reveals. All frames must come from one stream; `reset()` starts a
+        new one. Machine code is compiled when the step is created, which takes a minute or more after an installation.
     """
 
     sensor: str
@@ -43,7 +44,7 @@ class TactileProcessorStep(ObservationProcessorStep):
         self.area = self.tracker.reconstructor.estimator.membrane.rest_area.numpy()
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """The observation with what is felt added."""
+        """Return the observation with the tactile results added."""
         key = next((key for key in (self.name, self._image_key) if key in observation), None)
         if key is None:
             raise tm.MembraneError(
@@ -58,17 +59,17 @@ class TactileProcessorStep(ObservationProcessorStep):
         return observation | {key: value[None] if image.ndim == 4 else value for key, value in tensors.items()}
 
     def get_config(self) -> dict[str, Any]:
-        """What the step is made from again."""
+        """Return the arguments from which the step can be created again."""
         return {"sensor": self.sensor, "name": self.name}
 
     def reset(self) -> None:
-        """The next frame starts from rest."""
+        """Start the next frame from the rest state."""
         self.tracker.reset()
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """The features with what is felt added."""
+        """Return the features with those of the tactile results added."""
         observed = features.get(PipelineFeatureType.OBSERVATION, {})
         if self.name in observed:
             added: dict[str, Any] = dict.fromkeys(tactile.scalar_names(self.name), float)

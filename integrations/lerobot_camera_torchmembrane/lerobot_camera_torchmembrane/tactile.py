@@ -1,6 +1,6 @@
-"""What a frame's reconstruction is to a robot and to a policy: wrench, contacts and status; points with displacement and force.
+"""Tactile results of a frame for robots and policies: wrench, contacts and status; points with displacement and force.
 
-Where a frame has no surface they are zeros, as one NaN would spoil a data set's statistics: `status` tells them apart.
+They are zeros if a frame has no surface, because one NaN would spoil the statistics of a data set; `status` marks these frames.
 """
 
 import numpy as np
@@ -9,17 +9,17 @@ from torchmembrane.results.reconstruction import Frame
 
 WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 CONTACTS = 4
-"""Of a frame, strongest first."""
+"""Number of contacts of a frame, strongest first."""
 OF_CONTACT = ("x", "y", "z", "Fx", "Fy", "Fz")
 SIZES = {"wrench": 6, "contacts": CONTACTS * len(OF_CONTACT), "status": 1}
 
 
 def felt(frame: Frame) -> dict[str, np.ndarray]:
-    """`wrench [6]`, `contacts [24]` and `status [1]` of a frame, float32.
+    """Return `wrench [6]`, `contacts [24]` and `status [1]` of a frame, float32.
 
     Args:
-        frame: its arrays, as `Reconstruction.frame` gives them. `contacts` are its `contact_points` and `contact_force`:
-            x, y, z, Fx, Fy, Fz of each of four.
+        frame: arrays of the frame, as returned by `Reconstruction.frame`. `contacts` holds x, y, z, Fx, Fy, Fz of four
+            contacts, from `contact_points` and `contact_force`.
     """
     contacts = np.concatenate([frame["contact_points"], frame["contact_force"]], -1).ravel()
     values = {"wrench": frame["wrench"], "contacts": contacts, "status": np.atleast_1d(frame["status"])}
@@ -27,38 +27,38 @@ def felt(frame: Frame) -> dict[str, np.ndarray]:
 
 
 def points(frame: Frame, area: np.ndarray) -> np.ndarray:
-    """Displacement and contact force of every vertex, dx, dy, dz, Fx, Fy, Fz, `[V, 6]` float32.
+    """Return the displacement and contact force of every vertex, dx, dy, dz, Fx, Fy, Fz, `[V, 6]` float32.
 
     Args:
-        frame: its arrays.
-        area: `[V]`, of the vertices at rest.
+        frame: arrays of the frame.
+        area: areas of the vertices at rest, `[V]`.
     """
     force = frame["traction"] * area[:, None]
     return np.nan_to_num(np.concatenate([frame["displacement"], force], -1)).astype(np.float32)
 
 
 def scalars(frame: Frame, name: str) -> dict[str, float]:
-    """The same wrench and status one by one, as a robot's observations are: `NAME.Fx` ... `NAME.Mz`, `NAME.status`."""
+    """Return wrench and status as the single numbers of a robot's observations: `NAME.Fx` ... `NAME.Mz`, `NAME.status`."""
     values = felt(frame)
     return dict(zip(scalar_names(name), [*values["wrench"].tolist(), *values["status"].tolist()], strict=True))
 
 
 def scalar_names(name: str) -> list[str]:
-    """Of the observations of a sensor one by one."""
+    """Return the names of a sensor's single numbers in the observations."""
     return [f"{name}.{each}" for each in (*WRENCH, "status")]
 
 
 def key(name: str, what: str) -> str:
-    """Of an array of a sensor in a data set and in a policy's observations."""
+    """Return the key of a sensor's array in a data set and in a policy's observations."""
     return f"observation.tactile.{name}.{what}"
 
 
 def features(name: str, vertices: int | None = None) -> dict[str, dict]:
-    """A sensor's arrays as a LeRobot data set declares them.
+    """Return the declarations of a sensor's arrays for a LeRobot data set.
 
     Args:
         name: name of the sensor.
-        vertices: vertices of its points; None: without points.
+        vertices: number of vertices of the points; None: without points.
     """
     names = {"wrench": list(WRENCH), "status": ["status"]}
     names["contacts"] = [f"contact{k}.{each}" for k in range(1, CONTACTS + 1) for each in OF_CONTACT]

@@ -1,19 +1,19 @@
-"""Which LeRobot the plugin was tested with: of another one nothing is used, and nothing is changed."""
+"""The LeRobot release that the plugin was tested with; with any other release the plugin neither uses nor changes anything."""
 
 from importlib.metadata import version
 
 TESTED = "0.6"
-"""LeRobot's release; its later corrections (0.6.2 ...) are taken to be the same."""
+"""Tested release of LeRobot; its patch releases (0.6.2 ...) are assumed to be compatible."""
 
 
 def refuse_untested(installed: str | None = None) -> None:
-    """Refuse a LeRobot that the plugin was not tested with.
+    """Refuse a LeRobot release that the plugin was not tested with.
 
     Args:
-        installed: its version; None: the one that is installed.
+        installed: version of LeRobot; None: the installed one.
 
     Raises:
-        ImportError: it is another release. LeRobot logs that, and goes on without the plugin.
+        ImportError: it is another release. LeRobot logs this error and continues without the plugin.
     """
     found = installed or version("lerobot")
     if ".".join(found.split(".")[:2]) != TESTED:

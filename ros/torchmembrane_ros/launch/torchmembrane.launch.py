@@ -10,7 +10,7 @@ from launch_ros.actions import Node
 
 
 def generate_launch_description() -> LaunchDescription:
-    """A node in the namespace of its finger."""
+    """Return the launch description of one node, in the namespace of its finger."""
     declared = [
         DeclareLaunchArgument("namespace", default_value="finger"),
         DeclareLaunchArgument("sensor", description="path of the sensor file"),

@@ -10,7 +10,7 @@ from launch_ros.actions import Node
 
 
 def generate_launch_description() -> LaunchDescription:
-    """A node for each finger, in a namespace of its own."""
+    """Return the launch description of two nodes, each in the namespace of its finger."""
     fingers = ("left", "right")
     declared = [DeclareLaunchArgument(finger, description=f"sensor file of the {finger} finger") for finger in fingers]
     nodes = [

@@ -1,1 +1,1 @@
-"""A node of ROS 2: images of a soft tactile sensor in, wrench, tractions and pressure out."""
+"""A ROS 2 node that turns images of a soft tactile sensor into wrench, tractions and pressure."""

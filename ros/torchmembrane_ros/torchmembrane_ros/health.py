@@ -1,4 +1,4 @@
-"""How the node is doing, once a second on /diagnostics: rate, latency, statuses, drift, age of the calibration."""
+"""State of the node, published once a second on /diagnostics: rate, latency, statuses, drift, age of the calibration."""
 
 import time
 from collections import Counter, deque
@@ -12,13 +12,13 @@ import torchmembrane as tm
 from torchmembrane.integrations.frame_messages import DOUBTFUL, FAILED, GOOD, Message, diagnosis
 
 RECENT = 100
-"""Images over which rate and latency are taken."""
+"""Number of latest images over which rate and latency are computed."""
 SILENT = 2.0
-"""Seconds without an image after which that is said."""
+"""Seconds without an image after which this is reported."""
 
 
 class Followed(NamedTuple):
-    """An image that was reconstructed: when that was done (s), how old the image was by then (s), and its status."""
+    """A reconstructed image: time of completion (s), age of the image at that time (s), and status."""
 
     time: float
     latency: float
@@ -26,11 +26,11 @@ class Followed(NamedTuple):
 
 
 class Health:
-    """What is counted while images are followed.
+    """Statistics of the reconstructed images.
 
     Args:
-        sensor: that is followed.
-        path: path of its file, whose age is told where the file has no record of its calibration.
+        sensor: sensor of the node.
+        path: path of its file, whose age is reported if the file has no record of its calibration.
     """
 
     def __init__(self, sensor: tm.Sensor, path: Path):
@@ -41,20 +41,20 @@ class Health:
         self.refused = 0
 
     def add(self, latency: float, status: tm.Status) -> None:
-        """One more image."""
+        """Add a reconstructed image."""
         self.recent.append(Followed(time.monotonic(), latency, status))
         self.statuses[status] += 1
 
     def refuse(self) -> None:
-        """One more image that cannot be read."""
+        """Add an image that could not be read."""
         self.refused += 1
 
     def message(self, received: int, drift: float) -> Message:
-        """A `DiagnosticStatus`.
+        """Return a `DiagnosticStatus`.
 
         Args:
-            received: images so far; those that were neither followed nor refused were displaced by newer ones.
-            drift: px, of the tracker.
+            received: number of images so far; those neither reconstructed nor refused were replaced by newer ones.
+            drift: drift of the tracker, px.
         """
         recent = list(self.recent)
         times, latencies = [each.time for each in recent], [1000 * each.latency for each in recent]
@@ -77,12 +77,12 @@ class Health:
         return diagnosis(*self._judged(), values)
 
     def _age(self) -> dict[str, str]:
-        """Of the calibration, in days, or of the sensor file."""
+        """Return the age in days of the calibration, or of the sensor file."""
         what, day = ("calibration", self.record.calibrated) if self.record.calibrated else ("sensor file", self.written)
         return {f"age of the {what}, days": str((date.today() - day).days)}
 
     def _judged(self) -> tuple[int, str, str]:
-        """Level, name and words."""
+        """Return level, name and text."""
         name = f"torchmembrane: {self.name}"
         if not self.recent or time.monotonic() - self.recent[-1].time > SILENT:
             return DOUBTFUL, name, "no images come" if not self.refused else "images come, none can be followed"

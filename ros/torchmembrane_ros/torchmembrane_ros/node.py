@@ -1,11 +1,11 @@
-"""The node: newest image in, messages out; what arrives meanwhile is dropped.
+"""The node: it reconstructs the newest image and publishes the result; images that arrive in the meantime are dropped.
 
 ros2 run torchmembrane_ros tracker --ros-args -p sensor:=sensor.toml -r image:=/finger/image_raw
 
-A lifecycle node. Configured, it has read the sensor file and compiled what the first image would wait for; active, it
-subscribes, and publishes `~/wrench`, `~/force_deviation`, `~/points`, `~/contacts`, `~/status` and, of a gas, `~/pressure`
-with the image's header, and how it is doing on `/diagnostics`. The first CameraInfo beside the images is compared with the
-sensor file. The service `~/rezero` (std_srvs/Trigger) takes the latest image for the rest state.
+It is a lifecycle node. In the configured state it has read the sensor file and compiled the code that the first image needs; in
+the active state it subscribes, and publishes `~/wrench`, `~/force_deviation`, `~/points`, `~/contacts`, `~/status` and, for a
+gas, `~/pressure` with the header of the image, and its own state on `/diagnostics`. The first CameraInfo beside the images is
+compared with the sensor file. The service `~/rezero` (std_srvs/Trigger) takes the latest image as the rest state.
 """
 
 import time
@@ -41,11 +41,11 @@ AGAIN = 10.0
 PERIOD = 1.0
 """Seconds between two messages on /diagnostics."""
 WAIT = 0.1
-"""Seconds after which the thread that computes looks whether it shall end."""
+"""Seconds after which the computing thread checks whether to stop."""
 
 
 class TrackerNode(LifecycleNode):
-    """Follows one sensor's camera. A thread takes the newest image and computes; the executor's thread is free for all else."""
+    """Node for one sensor's camera. A thread computes from the newest image; the executor's thread stays free for callbacks."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("torchmembrane", **options)
@@ -56,7 +56,7 @@ class TrackerNode(LifecycleNode):
         self.thread: Thread | None = None
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Read the sensor file and get ready for images."""
+        """Read the sensor file and prepare for images."""
         try:
             self._configure()
         except tm.MembraneError as error:
@@ -68,7 +68,7 @@ class TrackerNode(LifecycleNode):
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Subscribe."""
+        """Subscribe to the images and start the computation."""
         super().on_activate(state)
         self.mailbox, self.compared = Mailbox(), False
         self.thread = Thread(target=self._compute, args=(self.mailbox,), name="compute", daemon=True)
@@ -81,30 +81,30 @@ class TrackerNode(LifecycleNode):
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of the images; the next ones start from rest."""
+        """Unsubscribe from the images; the next activation starts from the rest state."""
         self.stop()
         self.tracker.reset()
         return super().on_deactivate(state)
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the sensor."""
+        """Discard the sensor."""
         self._release()
         return SUCCESS
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Stop whatever goes on."""
+        """Stop all activity."""
         self.stop()
         self._release()
         return SUCCESS
 
     def on_error(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """After an error in a transition: unconfigured again."""
+        """Return to the unconfigured state after an error in a transition."""
         self.stop()
         self._release()
         return SUCCESS
 
     def compare(self, info: CameraInfo) -> None:
-        """Say what the first CameraInfo has otherwise than the sensor file."""
+        """Log how the first CameraInfo differs from the sensor file."""
         if not self.compared:
             self.compared = True
             try:
@@ -115,7 +115,7 @@ class TrackerNode(LifecycleNode):
                 self.get_logger().warning(remark)
 
     def rezero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Take the latest image for the rest state."""
+        """Take the latest image as the rest state."""
         try:
             with self.lock, warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
@@ -126,7 +126,7 @@ class TrackerNode(LifecycleNode):
         return response
 
     def report(self) -> None:
-        """Say how the node is doing, and subscribe anew where publishers of images came that offer otherwise."""
+        """Publish the state of the node, and subscribe again if new image publishers offer another reliability."""
         status = self.health.message(self.mailbox.captured, self.tracker.drift).built(make)
         self.diagnostics.publish(DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[status]))
         if self._reliability() != self.reliability:
@@ -134,7 +134,7 @@ class TrackerNode(LifecycleNode):
             self.subscriptions_made.append(self._subscribe())
 
     def follow(self, message: Image | CompressedImage) -> None:
-        """Reconstruct an image, and publish what it gives."""
+        """Reconstruct an image and publish the result."""
         try:
             grey = grey_of(message, self.camera.image_size, self.camera.bits)
             with self.lock, warnings.catch_warnings(record=True) as said:
@@ -177,7 +177,7 @@ class TrackerNode(LifecycleNode):
         self.rezero_service = self.create_service(Trigger, "~/rezero", self.rezero)
 
     def _send_transform(self, transform: Any) -> None:
-        """To /tf_static, where those that come later find it too."""
+        """Publish a transform on /tf_static, where later subscribers find it too."""
         from tf2_msgs.msg import TFMessage
 
         kept = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -185,7 +185,7 @@ class TrackerNode(LifecycleNode):
         self.transforms.publish(TFMessage(transforms=[transform]))
 
     def _reliability(self) -> ReliabilityPolicy:
-        """Of the subscription to images: what is asked for, or what all publishers offer."""
+        """Return the reliability of the image subscription: as configured, or what all publishers offer."""
         asked = self.get_parameter("reliability").value
         offered = [each.qos_profile.reliability for each in self.get_publishers_info_by_topic(self.resolve_topic_name("image"))]
         is_best_effort = ReliabilityPolicy.BEST_EFFORT in offered if asked == "auto" else asked == "best_effort"
@@ -209,7 +209,7 @@ class TrackerNode(LifecycleNode):
                         raise
 
     def stop(self) -> None:
-        """Let go of the images."""
+        """Stop the thread and unsubscribe from the images."""
         if self.thread is not None:
             self.mailbox.end()
             self.thread.join()
@@ -228,7 +228,7 @@ class TrackerNode(LifecycleNode):
 
 
 def main() -> None:
-    """Spin until interrupted."""
+    """Run the node until it is interrupted."""
     torch.set_num_threads(1)
     rclpy.init()
     node = TrackerNode()

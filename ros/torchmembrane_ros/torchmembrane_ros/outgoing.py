@@ -1,4 +1,4 @@
-"""Messages of the package as rclpy has them."""
+"""Conversion of the package's messages to rclpy messages."""
 
 from array import array
 from importlib import import_module
@@ -12,13 +12,13 @@ from torchmembrane.sensor.units import METRE
 
 
 def type_of(kind: str) -> Any:
-    """The class of a message type, as of "geometry_msgs/msg/Wrench"."""
+    """Return the class of a message type such as "geometry_msgs/msg/Wrench"."""
     package, _, name = kind.split("/")
     return getattr(import_module(f"{package}.msg"), name)
 
 
 def make(kind: str, **fields: Any) -> Any:
-    """A message of rclpy."""
+    """Return an rclpy message of a type, with its fields."""
     if "level" in fields:
         fields["level"] = bytes([fields["level"]])
     if "data" in fields:
@@ -27,7 +27,7 @@ def make(kind: str, **fields: Any) -> Any:
 
 
 def transform_of(sensor: tm.Sensor, tool_frame: str, frame_id: str) -> TransformStamped:
-    """The camera's pose in the tool's frame, in metres, as TF has it.
+    """Return the pose of the camera in the frame of the tool, in metres, as a TF message.
 
     Raises:
         MembraneError: the sensor file has no `[tool]`.
@@ -42,7 +42,8 @@ def transform_of(sensor: tm.Sensor, tool_frame: str, frame_id: str) -> Transform
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """x, y, z, w of a rotation `[3, 3]`: the eigenvector of a symmetric matrix's largest eigenvalue (Bar-Itzhack, 2000)."""
+    """Return the quaternion x, y, z, w of a rotation `[3, 3]`: the eigenvector of a symmetric matrix's largest eigenvalue
+    (Bar-Itzhack, 2000)."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     symmetric = np.array([
         [a - e - i, d + b, g + c, h - f],

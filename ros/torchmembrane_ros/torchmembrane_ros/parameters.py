@@ -1,4 +1,4 @@
-"""What the node is told at its start; none of it changes while it runs."""
+"""Parameters of the node, which are set at its start and do not change while it runs."""
 
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -18,13 +18,13 @@ PARAMETERS = {
     ),
     "autostart": (True, "Whether the node configures and activates itself; else a lifecycle manager does."),
 }
-"""Of each parameter: default and description."""
+"""Default and description of each parameter."""
 MOST_IMAGES = 1000
-"""The largest `depth`."""
+"""Largest value of `depth`."""
 
 
 def declare(node: Node) -> None:
-    """Declare the parameters, each read-only with its description and range."""
+    """Declare the parameters, all read-only, with their descriptions and ranges."""
     for name, (default, description) in PARAMETERS.items():
         span = [IntegerRange(from_value=1, to_value=MOST_IMAGES, step=1)] if name == "depth" else []
         descriptor = ParameterDescriptor(description=description, read_only=True, integer_range=span)
@@ -32,10 +32,10 @@ def declare(node: Node) -> None:
 
 
 def refuse_wrong(node: Node) -> None:
-    """Refuse values that the types and ranges do not tell.
+    """Refuse values that types and ranges do not exclude.
 
     Raises:
-        MembraneError: `reliability` is none of its choices, or `tool_frame` is given without `frame_id`.
+        MembraneError: `reliability` is not one of its choices, or `tool_frame` is given without `frame_id`.
     """
     reliability, tool_frame, frame_id = (node.get_parameter(name).value for name in ("reliability", "tool_frame", "frame_id"))
     if reliability not in RELIABILITIES:
