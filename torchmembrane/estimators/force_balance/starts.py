@@ -99,23 +99,12 @@ class InitialGuess(nn.Module):
         near = torch.exp(-off2 / (2 * CENTRE_RADIUS**2)) * self.area
         return torch.lt((near * pushes).sum(-1) / near.sum(-1), RING_SHARE * pushes.amax(-1))
 
-    def best_of_starts(self, quick: State, slow: State, rest: State, measured: MeasuredRays, schedule: Schedule) -> Found:
-        """The best solution from several starts, and the displacement a step before it.
+    def best_of_starts(self, state: State, measured: MeasuredRays, schedule: Schedule) -> Found:
+        """The best of the solutions found from three different dents of a state, and the displacement a step before it.
 
-        The starts are dents of two states and two states found from `rest` on this grid: one by a loss that is sharp from the
-        beginning, one without a cone, so that shear is expensive even under a push. Of solutions that are about as good, the
-        first is taken, so that answers do not jump between them.
+        Of solutions that are about as good, the first is taken, so that answers do not jump between them.
         """
-        settings = self.gauss_newton.settings
-        steps = 2 * settings.steps
-        starts = [
-            self(*slow, measured),
-            self.deep(*slow, measured),
-            self.wide(*slow, measured),
-            self.deep(*quick, measured),
-            self.gauss_newton(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
-            self.gauss_newton(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
-        ]
+        starts = [dented(*state, measured) for dented in (self, self.deep, self.wide)]
 
         def stepped(start: Sequence[Tensor], measured: MeasuredRays) -> Sequence[Tensor]:
             state, before = self.gauss_newton(State(*start), measured, schedule)
