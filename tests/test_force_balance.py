@@ -222,18 +222,17 @@ def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
     torch.testing.assert_close(inner(exact, estimator.membrane.grid), expected)
 
 
-def test_steps_take_the_cone_they_are_given(pressed):
-    """As an estimator with that cone in its settings takes them; the loss that answers are compared by keeps its own."""
+def test_steps_take_the_cone_of_their_grid(pressed):
+    """Without it shear is as expensive under a push as elsewhere, and another surface is found."""
     (origins, directions), *_ = pressed
     steep, usual = make(13), make(13)
     steep.equations.loss.cone = 0.0
     found = []
-    for one, cone in ((steep, None), (usual, 0.0), (usual, None)):
+    for one in (steep, usual):
         measured = one.equations.bearings.measured(seen(origins, directions))
         schedule = SETTINGS.gnc_schedule(4, SETTINGS.tau)
-        found.append(one.gauss_newton(one.at_rest(measured.weight), measured, schedule, cone=cone)[0].u)
-    torch.testing.assert_close(found[1], found[0], rtol=0, atol=0)
-    assert (found[2] - found[0]).abs().max() > 0.01
+        found.append(one.gauss_newton(one.at_rest(measured.weight), measured, schedule)[0].u)
+    assert (found[1] - found[0]).abs().max() > 0.01
 
 
 @pytest.mark.parametrize(("n", "share"), [(9, 0.7), (17, 0.3), (33, 0.1)])

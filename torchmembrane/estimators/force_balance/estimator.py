@@ -216,8 +216,7 @@ class ForceBalance(Estimator):
                 settling, damping = self.settings.settling_steps, self.settings.retry_damping
             found = self.gauss_newton(self._begun(measured, is_retry), measured, schedule, settling=settling, damping=damping)
         elif is_retry:
-            quick, slow = (self._undented(measured, is_retry) for is_retry in (False, True))
-            found = self.dent.best_of_starts(quick, slow, self.at_rest(measured.weight), measured, last)
+            found = self.dent.best_of_starts(self._undented(measured, is_retry), measured, last)
         else:
             found = self.gauss_newton(self.dent(*self._undented(measured), measured), measured, last)
         return found

@@ -80,7 +80,6 @@ class GaussNewton(nn.Module):
         state: State,
         measured: MeasuredRays,
         schedule: list[tuple[float, float]],
-        cone: float | None = None,
         settling: int = 1,
         damping: float | None = None,
     ) -> tuple[State, Tensor]:
@@ -90,18 +89,16 @@ class GaussNewton(nn.Module):
             state: initial state.
             measured: the markers' rays.
             schedule: scales of the losses in every step.
-            cone: as for `TractionLoss.weights`.
             settling: number of last steps with at least `damping`, so that the solution settles.
             damping: damping of these steps; default `settling_damping`.
         """
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         if self.is_native(*state, *measured):
             frames = max(frames, torch.get_num_threads())
-        cone = self.equations.loss.cone if cone is None else cone
         damping = self.settings.settling_damping if damping is None else damping
         taus, size = [tau for tau, _ in schedule], len(schedule)
         numbers = [self._numbers(taus[: k + 1], damping if size - k <= settling else 0.0) for k in range(size)]
-        rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
+        rows = [(*scales, self.equations.loss.cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
         u, pressure, moved, before = chunked(frames, self._run_chunk, (*state, *measured), rows, settling)
         return State(u, pressure, moved), before
 

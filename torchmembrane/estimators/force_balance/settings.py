@@ -50,7 +50,6 @@ class ForceBalanceSettings:
         finer_steps: number of steps from the solution of any other grid.
         tau: first and last scale of the loss of compressive traction, from rest.
         fine_tau: the same from the coarsest grid's solution. Finer grids start with the last scale, to stay in its basin.
-        sharp_tau: the same from rest on the second coarsest grid, in a second try.
         retry_steps_factor: number of steps from rest in a second try, relative to the first.
         retry_tau: `tau` of a second try.
         retry_fine_tau: `fine_tau` of a second try.
@@ -119,7 +118,6 @@ class ForceBalanceSettings:
     finer_steps: int = 3
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
-    sharp_tau: tuple[float, float] = (1.0, 0.4)
     retry_steps_factor: int = 4
     retry_tau: tuple[float, float] = (16.0, 0.4)
     retry_fine_tau: tuple[float, float] = (2.0, 0.4)

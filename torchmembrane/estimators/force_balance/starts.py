@@ -106,30 +106,17 @@ class InitialGuess(nn.Module):
         near = torch.exp(-off2 / (2 * CENTRE_RADIUS**2)) * self.area
         return torch.lt((near * pushes).sum(-1) / near.sum(-1), RING_SHARE * pushes.amax(-1))
 
-    def best_of_starts(self, quick: State, slow: State, rest: State, measured: MeasuredRays, schedule: Schedule) -> Found:
-        """Return the best solution from several starts, and the displacement one step before it.
+    def best_of_starts(self, state: State, measured: MeasuredRays, schedule: Schedule) -> Found:
+        """Return the best of the solutions found from three different dents of a state, and the displacement one step before it.
 
-        Four starts are dented states. Two more are found from `rest` on this grid: one with a loss that is sharp from the
-        beginning, one without a cone, so that shear is expensive even under a push. Among solutions with a similar objective
-        the first is chosen, so that results do not jump between them.
+        Among solutions with a similar objective the first is chosen, so that results do not jump between them.
 
         Args:
-            quick: state from the first try's schedule, to be dented.
-            slow: state from the second try's schedule, to be dented.
-            rest: rest state.
+            state: state before the dents.
             measured: the markers' rays.
             schedule: scales of the losses in every step.
         """
-        settings = self.gauss_newton.settings
-        steps = 2 * settings.steps
-        starts = [
-            self(*slow, measured),
-            self.deep(*slow, measured),
-            self.wide(*slow, measured),
-            self.deep(*quick, measured),
-            self.gauss_newton(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
-            self.gauss_newton(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
-        ]
+        starts = [dented(*state, measured) for dented in (self, self.deep, self.wide)]
 
         def stepped(start: Sequence[Tensor], measured: MeasuredRays) -> Sequence[Tensor]:
             state, before = self.gauss_newton(State(*start), measured, schedule)
