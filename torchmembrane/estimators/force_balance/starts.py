@@ -107,7 +107,7 @@ class InitialGuess(nn.Module):
         return torch.lt((near * pushes).sum(-1) / near.sum(-1), RING_SHARE * pushes.amax(-1))
 
     def best_of_starts(self, state: State, measured: MeasuredRays, schedule: Schedule) -> Found:
-        """Return the best of the solutions found from three different dents of a state, and the displacement one step before it.
+        """Return the best solution from three different dents of a state, and the displacement one step before it.
 
         Among solutions with a similar objective the first is chosen, so that results do not jump between them.
 
