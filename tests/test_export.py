@@ -88,7 +88,7 @@ def opened(path: str, model: bytes | None = None) -> InferenceSession:
     """One session for each model, as it takes long to optimise one; what becomes of it is kept as .ort beside the file."""
     if path not in SESSIONS:
         options = SessionOptions()
-        options.intra_op_num_threads, options.log_severity_level = 1, 3
+        options.intra_op_num_threads, options.log_severity_level, options.enable_mem_reuse = 1, 3, False
         if path.endswith(".onnx"):
             options.optimized_model_filepath = str(Path(path).with_suffix(".ort"))
         SESSIONS[path] = InferenceSession(model or path, options, providers=["CPUExecutionProvider"])

@@ -74,7 +74,7 @@ def count(graph) -> int:
 
 def open_session(path: Path, threads: int, **settings) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads, options.enable_mem_reuse = threads, False
     for key, value in settings.items():
         setattr(options, key, value)
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

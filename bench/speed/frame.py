@@ -40,7 +40,7 @@ def unit() -> Callable[[], None]:
 def model(path: Path, images: torch.Tensor, pixels: torch.Tensor) -> Callable[[], object]:
     """One frame in onnxruntime."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.log_severity_level = 1, 3
+    options.intra_op_num_threads, options.log_severity_level, options.enable_mem_reuse = 1, 3, False
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     given = {"image": images[:1].numpy(), "previous_pixels": pixels[:1].numpy()}
     feed = {each.name: given[each.name] for each in session.get_inputs()}
