@@ -573,7 +573,7 @@ def test_images_of_anything_and_any_size_are_searched_or_refused():
 
 def test_a_membrane_outside_the_image_is_refused():
     s = scene()
-    with pytest.raises(MembraneError, match="dots is not in the image of 320 x 240 px"):
+    with pytest.raises(MembraneError, match="dots are not in the image of 320 x 240 px"):
         membrane_mask(s.pixels + 1e4, s.pixels[:4] + 1e4, (320, 240))
 
 

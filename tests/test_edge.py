@@ -320,7 +320,7 @@ REFUSED = {
     "float_255.tif": (saved(GREY.astype(np.float32), "TIFF"), "float values from 0.0 to 235.0; expected finite, in 0..1"),
     "nan.tif": (saved(np.full((6, 8), np.nan, np.float32), "TIFF"), "float values from nan to nan"),
     "large_32.tif": (saved(WIDE.astype(np.int32) * 2, "TIFF"), "32-bit values from 0 to 120790; 8 or 16 bits are read"),
-    "signed_16.tif": (tiff(WIDE // 2, kind=2), "its values have signs"),
+    "signed_16.tif": (tiff(WIDE // 2, kind=2), "its values are signed integers"),
     "list.jpg": (sequence("MPO").replace(b"MPF\0", b"MPF\0??", 1), "not readable as an image ("),
     "planes_16.tif": (tiff([WIDE] * 3, photometric=2, planes=3), "colour or alpha of more than 8 bits"),
 }
@@ -388,7 +388,7 @@ def test_a_preview_in_a_jpeg_is_no_frame(model, call, images, tmp_path):
 def test_pictures_of_a_tiff_that_only_imagej_finds_are_told(model, call, images, tmp_path):
     path = images("a.tif", Image.fromarray(GREY), tiffinfo={270: "ImageJ=1.54f\nimages=40\nframes=40\n"})
     code, _, err = call(model, path, "--out", tmp_path / "r")
-    assert code == 1 and "holds 40 pictures as ImageJ says there, but 1 pages; expected a page for each" in err
+    assert code == 1 and "holds 40 images by its ImageJ description, but 1 pages; expected one page per image" in err
 
 
 def test_files_that_systems_leave_are_passed_over(model, call, images, tmp_path):
@@ -490,8 +490,8 @@ FILES = {
     "vertices ragged": (model_of(metadata({"rest_vertices": [[0, 0], [1]]})), "metadata are not readable"),
     "vertices null": (model_of(metadata({"rest_vertices": [[None] * 3] * 9})), "rest_vertices is object"),
     "vertices few": (model_of(metadata({"rest_vertices": VERTICES[:4].tolist()})), "rest_normals is float64 [9, 3]"),
-    "triangles beyond": (model_of(metadata({"triangles": [[0, 1, 9]]})), "other corners than its vertices"),
-    "triangles negative": (model_of(metadata({"triangles": [[0, 1, -1]]})), "other corners than its vertices"),
+    "triangles beyond": (model_of(metadata({"triangles": [[0, 1, 9]]})), "triangles refer to vertices that do not exist"),
+    "triangles negative": (model_of(metadata({"triangles": [[0, 1, -1]]})), "triangles refer to vertices that do not exist"),
     "fixed of numbers": (model_of(metadata({"fixed": [0.5] * 9})), "fixed is float64 [9]"),
     "grid of another": (model_of(metadata({"grid": [3, 4]})), "grid [3, 4]"),
     "tool cut": (model_of(metadata({"camera_in_tool": [[1, 0, 0, 0]]})), "camera_in_tool [[1.0, 0.0, 0.0, 0.0]]"),
@@ -811,7 +811,7 @@ def test_no_images_give_no_rows(edge, model):
 def test_a_model_that_gives_other_than_a_row_for_each_image_is_refused(edge, tmp_path):
     model = tmp_path / "model.onnx"
     model.write_bytes(model_of(metadata(), rows=3))
-    with pytest.raises(edge.EdgeError, match="other than a row for each image|cannot run the model on 2 images"):
+    with pytest.raises(edge.EdgeError, match="does not return one row per image|cannot run the model on 2 images"):
         edge.Session(model).run(np.stack([GREY, GREY]))
 
 
@@ -824,7 +824,7 @@ def test_results_that_a_frame_cannot_start_from_are_refused(edge, tmp_path):
     for wrong in ({}, [], {"pixels": np.zeros((2, 1, 2), np.float32)}, {"pixels": None}, {"pixels": [["a", "b"]]}):
         with pytest.raises(edge.EdgeError, match="expected"):
             session.run(GREY, wrong)
-    with pytest.raises(edge.EdgeError, match="2 images after results with pixels"):
+    with pytest.raises(edge.EdgeError, match="2 images with previous results pixels"):
         session.run(np.stack([GREY, GREY]), first)
     assert [len(found["status"]) for found in session.track([GREY, GREY.tolist() and GREY])] == [1, 1]
     with pytest.raises(edge.EdgeError, match="NoneType; expected a video's images"):
@@ -855,7 +855,7 @@ def test_what_is_no_path_is_refused(path, edge):
 
 
 def test_a_wrench_without_tool_or_of_other_results_is_refused(edge, model, tmp_path):
-    with pytest.raises(edge.EdgeError, match="knows no tool"):
+    with pytest.raises(edge.EdgeError, match="has no tool"):
         edge.Session(model).wrench_in_tool({})
     path = tmp_path / "tool.onnx"
     path.write_bytes(model_of(metadata({"camera_in_tool": np.eye(4)[:3].tolist()})))

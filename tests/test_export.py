@@ -329,9 +329,9 @@ def test_a_stream_by_a_model_gives_what_the_model_gives(model_file, tracking, re
         frame = stream(image, 0.0)
         assert frame.keys() == each.keys() and all(np.array_equal(frame[key], each[key][0], equal_nan=True) for key in each)
     np.testing.assert_array_equal(stream.mesh.rest_vertices, reconstructor.estimator.membrane.rest.float().numpy())
-    with pytest.raises(MembraneError, match="rest state baked in"):
+    with pytest.raises(MembraneError, match="contains a fixed rest state"):
         stream.rezero()
-    with pytest.raises(MembraneError, match="of another sensor, 'cap'"):
+    with pytest.raises(MembraneError, match="it belongs to another sensor, 'cap'"):
         ModelStream(model_file, 64 * "0")
     with pytest.raises(MembraneError, match="--model .*no such file"):
         ModelStream(tmp_path / "none.onnx", sensor)

@@ -328,7 +328,9 @@ def test_bits_of_a_file_itself_go_before_the_camera_s_and_colour_of_16_is_refuse
     assert np.abs(decode_image(content, "a.tif", bits=10) - expected).max() < 1e-6
     colour = tiff([(np.full((4, 12), 9, np.uint16), {256: 4, 262: 2, 277: 3})])
     decode_image(colour, "a.tif")
-    with pytest.raises(MembraneError, match="a.tif: .*colour of 16 bits, of which 8 are read, so bits = 12 is lost"):
+    with pytest.raises(
+        MembraneError, match="a.tif: .*colour with 16 bits per channel, of which 8 are read, so bits = 12 does not apply"
+    ):
         decode_image(colour, "a.tif", bits=12)
 
 

@@ -598,7 +598,7 @@ def test_the_command_follows_a_camera_and_says_what_ended_it(small_sensor, small
     [
         ([], "no source; expected one of --camera NUMBER, --video FILE, --images FOLDER"),
         (["--camera", "0", "--images", "."], "--camera and --images; expected one"),
-        (["--camera", "0", "--rate", "9"], "a camera has its own pace"),
+        (["--camera", "0", "--rate", "9"], "a camera sets its own rate"),
         (["--camera", "0", "--model", "a.onnx", "--grid", "9", "9"], "--grid with --model"),
         (["--camera", "0", "--model", "a.onnx", "--estimator", "paper"], "--estimator with --model"),
         (["--camera", "0", "--model", "a.onnx", "--device", "cuda"], "--device with --model"),

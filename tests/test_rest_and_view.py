@@ -127,7 +127,7 @@ def test_what_the_lens_cannot_image_is_no_error(fingertip):
     assert not reconstructor.vertex_pixels.isfinite().all()
     result = reconstructor.from_pixels(reconstructor.rest_pixels, reconstructor.observer.seen_at_rest.float())
     assert result.status.tolist() == [0] and result.force.norm() < 1e-3
-    with pytest.raises(tm.MembraneError, match="cannot be imaged"):
+    with pytest.raises(tm.MembraneError, match="cannot be projected"):
         tm.Reconstructor(lowered, "minimum-energy")
 
 

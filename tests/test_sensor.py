@@ -568,10 +568,12 @@ def test_a_listed_file_that_is_none_is_not_quoted(tmp_path):
 
 def test_dots_that_lie_on_one_another_are_named_with_both_lines(tmp_path):
     message = refusal(write(tmp_path, dots=[*DOTS, DOTS[2]]))
-    assert f"{tmp_path / 'dots.csv'}, line 5: the dot at [3.0, 0.0, 13.7] lies on that" in message and "line 3" in message
+    assert (
+        f"{tmp_path / 'dots.csv'}, line 5: the dot at [3.0, 0.0, 13.7] coincides with that" in message and "line 3" in message
+    )
     sensor = Sensor.from_file(write(tmp_path / "b"))
     twice = dataclasses.replace(sensor.markers, positions=np.repeat(sensor.markers.positions, 2, 0), sizes=["small"] * 6)
-    with pytest.raises(MembraneError, match=r"markers.positions\[1\] .* lies on that .*remove one"):
+    with pytest.raises(MembraneError, match=r"markers.positions\[1\] .* coincides with that .*remove one"):
         dataclasses.replace(sensor, markers=twice)
 
 
@@ -583,7 +585,7 @@ def test_how_far_off_or_near_a_dot_may_be_is_measured_by_the_surface(scale):
     with pytest.raises(MembraneError, match="off the rest surface"):
         refuse_off_surface(membrane, (dot + 1.1 * OFF_SURFACE * unit * outward)[None], ["a"])
     refuse_coincident(membrane, np.stack([dot, dot + [1.1 * LEAST_APART * unit, 0, 0]]), ["a", "b"])
-    with pytest.raises(MembraneError, match="lies on that"):
+    with pytest.raises(MembraneError, match="coincides with that"):
         refuse_coincident(membrane, np.stack([dot, dot + [0.9 * LEAST_APART * unit, 0, 0]]), ["a", "b"])
 
 

@@ -85,7 +85,9 @@ def test_a_stack_of_imagej_without_its_directory_is_refused(tmp_path):
     path = tmp_path / "large.tif"
     path.write_bytes(tiff([(EIGHT[0], {270: "ImageJ=1.53t\nimages=500\nslices=500\n"})]))
     for read in (lambda: read_image(path), lambda: list(stack_images(path, SIZE))):
-        with pytest.raises(MembraneError, match=r"large.tif: holds 500 pictures as ImageJ says .*leads to 1; expected a page"):
+        with pytest.raises(
+            MembraneError, match=r"large.tif: holds 500 images by its ImageJ description, .*directory has 1; expected one page"
+        ):
             read()
     path.write_bytes(tiff([(image, {270: "ImageJ=1.53t\nimages=3\n"}) for image in EIGHT]))
     assert len(list(stack_images(path, SIZE))) == 3

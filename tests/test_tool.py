@@ -228,7 +228,7 @@ def test_an_exported_model_knows_the_tool(reconstructor, results, tmp_path, monk
     bare = metadata | {"mesh": json.dumps(mesh | {"camera_in_tool": []})}
     before = metadata | {"mesh": json.dumps({key: value for key, value in mesh.items() if key != "camera_in_tool"})}
     for without in (bare, before):
-        with pytest.raises(EdgeError, match=r"knows no tool; expected one of a sensor file with \[tool\]"):
+        with pytest.raises(EdgeError, match=r"has no tool; expected a model of a sensor file with \[tool\]"):
             Session(model_that_says(without, tmp_path / "none.onnx")).wrench_in_tool({})
 
 

@@ -92,7 +92,9 @@ def image_files(arguments: Sequence[str]) -> list[Path]:
     for name, uses in Counter(map(frame_name, paths)).items():
         if uses > 1:
             twins = printable(", ".join(str(path) for path in paths if frame_name(path) == name))
-            raise EdgeError(f"two images of the name {name!r} ({twins}); results bear it: rename, or use two calls")
+            raise EdgeError(
+                f"two images of the name {name!r} ({twins}); results are named after images: rename, or use two calls"
+            )
     for name, path in files.items():
         if name == "mesh":
             raise EdgeError(f"{printable(path)}: its result would be mesh.npz, which holds the mesh: rename the image")

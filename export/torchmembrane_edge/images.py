@@ -215,7 +215,9 @@ def _numbers(image: Any, content: bytes) -> tuple[list[int], bool]:
     image.seek(0)
     told = IMAGEJ.match(str(image.tag_v2.get(DESCRIPTION, "")))
     if told and int(told[1]) > max(len(whole), 1) and not cut:  # of large files ImageJ leaves the pages out
-        raise EdgeError(f"holds {told[1]} pictures as ImageJ says there, but {len(whole)} pages; expected a page for each")
+        raise EdgeError(
+            f"holds {told[1]} images by its ImageJ description, but {len(whole)} pages; expected one page per image"
+        )
     return whole or [0], cut
 
 
@@ -269,12 +271,14 @@ def _grey(image: Any, number: int, size: tuple[int, int], bits: int | None) -> n
         tags = dict(image.tag_v2) if image.format == "TIFF" else {}
         depth = max(tags.get(BITS, (8,)))
         if SIGNED in tags.get(SAMPLE, ()) and depth <= 16:
-            raise EdgeError("its values have signs; expected whole numbers from 0 to white, or float in 0..1")
+            raise EdgeError("its values are signed integers; expected whole numbers from 0 to white, or float in 0..1")
         if image.mode in ("F", "I") or image.mode.startswith("I;16"):
             return _as_stored(_grey_of_more_bits(image, tags, bits), tags)
         wide = "16" in _layout(image)
         if (bits and wide) or (depth > 8 and not wide):
-            raise EdgeError("colour or alpha of more than 8 bits is not read as it is; expected grey of 16 bits, or 8 bits")
+            raise EdgeError(
+                "colour or alpha with more than 8 bits per channel is not supported; expected grey with 16 bits, or 8 bits"
+            )
         values = np.asarray(image.convert("L" if image.mode in ("1", "L", "LA", "La") else "RGB"))  # alpha is ignored
         return _as_stored(grey(values[None]), tags)
 

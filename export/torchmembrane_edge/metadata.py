@@ -103,7 +103,7 @@ def _mesh(found: dict[str, Any]) -> dict[str, Any]:
         said = [f"{key} {mesh[key].tolist()}" for key in ("image_size", "grid", "camera_in_tool")]
         raise ValueError(f"mesh: {', '.join(said)} of {sizes['V']} vertices")
     if not np.isin(mesh["triangles"], np.arange(sizes["V"])).all():
-        raise ValueError("mesh: its triangles have other corners than its vertices")
+        raise ValueError("mesh: its triangles refer to vertices that do not exist")
     return mesh
 
 

@@ -89,7 +89,7 @@ class Session:
         except Exception as error:  # as above
             raise EdgeError(f"onnxruntime cannot run the model on {count} images ({in_one_line(error)})") from error
         if any(values.shape[:1] != (count,) for values in results.values()):
-            raise EdgeError(f"the model of {self.name!r} gives other than a row for each image; expected {EXPECTED}")
+            raise EdgeError(f"the model of {self.name!r} does not return one row per image; expected {EXPECTED}")
         return results
 
     def _fed(self, images: Any) -> dict[str, np.ndarray]:
@@ -135,7 +135,7 @@ class Session:
         pose = self.mesh["camera_in_tool"]
         if not len(pose):
             raise EdgeError(
-                f"the model of {self.name!r} knows no tool; expected one of a sensor file with [tool]: export it again"
+                f"the model of {self.name!r} has no tool; expected a model of a sensor file with [tool]: export it again"
             )
         wrench = np.asarray(results.get("wrench") if isinstance(results, Mapping) else results)
         if wrench.ndim != 2 or wrench.shape[1] != 6 or wrench.dtype.kind != "f":
@@ -252,7 +252,7 @@ def _state(key: str, shape: tuple[int, ...], previous: Mapping[str, np.ndarray] 
     values = np.asarray(previous.get(key) if isinstance(previous, Mapping) else previous)
     if values.shape != shape or values.dtype.kind != "f":
         raise EdgeError(
-            f"{shape[0]} images after results with {key} {values.dtype} {list(values.shape)}; expected {list(shape)}, the "
+            f"{shape[0]} images with previous results {key} {values.dtype} {list(values.shape)}; expected {list(shape)}, the "
             "results of `run` for as many images"
         )
     return values.astype(np.float32)

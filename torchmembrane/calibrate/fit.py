@@ -79,7 +79,9 @@ def fit(
     if first.size <= start.size:
         raise MembraneError(f"{what}: {first.size} data for {start.size} unknowns; expected more: give more images or dots")
     if not np.isfinite(first).all():
-        raise MembraneError(f"{what}: parts cannot be imaged from the first guess; check the sensor file's design values")
+        raise MembraneError(
+            f"{what}: some points cannot be projected from the first guess; check the sensor file's design values"
+        )
     solution = least_squares(
         residuals, start, jacobian, x_scale="jac", xtol=TOLERANCE, ftol=TOLERANCE, gtol=None, max_nfev=MOST_STEPS
     )

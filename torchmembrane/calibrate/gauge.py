@@ -66,7 +66,7 @@ def modulus_from_pressures(
     worst = int(np.nanargmax(abs(off)))
     if spare and abs(off[worst]) > CONTRADICTION:
         raise MembraneError(
-            f"calibrate material: the readings contradict one another: image {worst + 1}'s is {readings[worst]:.4g}, by the "
+            f"calibrate material: the readings contradict each other: image {worst + 1}'s is {readings[worst]:.4g}, by the "
             f"others {ratio * at.change[worst] + offset:.4g}; expected readings of one gauge, taken with the images, of a "
             "cavity that does not leak"
         )
@@ -83,7 +83,7 @@ def _line(change: np.ndarray, readings: np.ndarray, sigma: np.ndarray, since_res
         remedy = "pressed images with their readings" if since_rest else "an image at rest and pressed ones with their readings"
         raise MembraneError(
             "calibrate material: the images with readings show pressure changes of at most "
-            f"{np.abs(change - centre).max():.3g}, too little to tell a modulus; expected {remedy}"
+            f"{np.abs(change - centre).max():.3g}, too little to determine the modulus; expected {remedy}"
         )
     slope = (w * (change - centre) * readings).sum() / information
     if not slope > 0:
@@ -100,7 +100,7 @@ def _response(change: np.ndarray, stiffer: np.ndarray) -> float:
     response = float(np.log((change * stiffer).sum() / (change**2).sum()) / np.log(STIFFER))
     if not response > LEAST_RESPONSE:
         raise MembraneError(
-            "calibrate material: the gas is so soft that its pressure tells how much volume the press takes, not how stiff the "
-            "membrane is; expected a smaller cavity, or presses of known force, --forces"
+            "calibrate material: the gas is so compliant that its pressure depends on the displaced volume, not on how stiff "
+            "the membrane is; expected a smaller cavity, or presses of known force, --forces"
         )
     return response

@@ -211,8 +211,8 @@ class Presses:
         unsure = (spread.force.norm(dim=1) > UNSURE * force.norm(dim=1)).numpy()
         for i in np.flatnonzero(known & unsure):
             raise MembraneError(
-                f"calibrate material: image {i + 1} hardly shows a force, though one is given for it; expected presses that "
-                "dent the membrane visibly: leave it out"
+                f"calibrate material: image {i + 1} shows hardly any force, although a force is given for it; expected presses "
+                "that dent the membrane visibly: leave it out"
             )
 
     def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

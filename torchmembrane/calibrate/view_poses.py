@@ -171,7 +171,9 @@ def recognised(sensor: Sensor, pattern: DotPattern) -> tuple[np.ndarray, np.ndar
     """
     shown = markers_in_view(sensor)
     if shown.sum() < FEWEST_MARKERS:
-        raise MembraneError(f"{shown.sum()} dots would be seen from the pose in the file; expected at least {FEWEST_MARKERS}")
+        raise MembraneError(
+            f"{shown.sum()} dots would be visible from the pose in the file; expected at least {FEWEST_MARKERS}"
+        )
     X, pivot = np.asarray(sensor.markers.positions)[shown], np.asarray(sensor.markers.positions)[shown].mean(0)
     sizes = np.array([int(size == "large") for size in sensor.markers.sizes or ()], dtype=int)[shown]
     starts = _overlays(_seen(sensor, X), pattern.pixels)

@@ -83,15 +83,15 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progr
         odd = np.flatnonzero(apart >= min(CONTRADICTION, apart.max()))
         shown = ", ".join(f"image {i + 1} shows {forces[i] / np.median(forces):.3g}" for i in odd)
         raise MembraneError(
-            f"calibrate material: the images contradict one another: {shown} times the others' force; expected images "
+            f"calibrate material: the images contradict each other: {shown} times the others' force; expected images "
             "under this weight alone: leave out what is not"
         )
     scatter = float(np.sqrt((((forces - weight) / sigma) ** 2).sum() / max(len(forces) - 1, 1)))
     deviation = float((deviations**-2).sum() ** -0.5 * max(1.0, scatter))
     if deviation > SURE:
         raise MembraneError(
-            f"calibrate material: the weight tells the scale of forces to {deviation:.1%} only; expected {SURE:.0%} at most, "
-            "for forces right to a tenth: a heavier weight, or several photographs of it"
+            f"calibrate material: the weight determines the scale of forces to {deviation:.1%} only; expected {SURE:.0%} at "
+            "most, for forces right to a tenth: a heavier weight, or several photographs of it"
         )
     return WeightFit(made, material, forces, deviation)
 
@@ -126,7 +126,7 @@ def _told(sensor: Sensor, images: Tensor) -> tuple[np.ndarray, np.ndarray]:
             )
         if not deviations[i] < UNSURE:
             raise MembraneError(
-                f"calibrate material: image {i + 1} shows a force that is known to {100 * deviations[i]:.0f} % only; expected "
+                f"calibrate material: image {i + 1} shows a force whose relative error is {100 * deviations[i]:.0f} %; expected "
                 "a weight that dents the membrane visibly: a heavier one"
             )
     return forces, deviations

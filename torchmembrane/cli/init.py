@@ -200,7 +200,7 @@ def run(arguments: Namespace) -> int:
     refuse_overwriting(f"init {path}", companions_of(path), read, arguments.force)
     if arguments.outline is not None:
         if arguments.shape is not None:
-            raise MembraneError("init: --outline and --shape; expected one of them, either says the rim")
+            raise MembraneError("init: --outline and --shape; expected only one of them, because both define the rim")
         arguments.shape = OUTLINE
     if arguments.shape is None:
         arguments.shape = _asked("shape", *QUESTIONS["shape"])

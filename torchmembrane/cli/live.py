@@ -136,11 +136,11 @@ def _check(arguments: Namespace) -> None:
         came = " and ".join(given) or "no source"
         raise MembraneError(f"live: {came}; expected one of --camera NUMBER, --video FILE, --images FOLDER")
     if arguments.rate is not None and arguments.camera is not None:
-        raise MembraneError("live: --rate with --camera; a camera has its own pace: leave --rate out")
+        raise MembraneError("live: --rate with --camera; a camera sets its own rate: leave --rate out")
     foreign = [name for name in OF_TORCH if getattr(arguments, name) is not None]
     foreign += [name for name, default in DEFAULTS.items() if getattr(arguments, name) != default]
     if arguments.model is not None and foreign:
-        raise MembraneError(f"live: --{foreign[0]} with --model; a model has its own: export it with that")
+        raise MembraneError(f"live: --{foreign[0]} with --model; a model contains its own: export it with that option")
     check_device(arguments.device)
 
 

@@ -175,7 +175,7 @@ def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "
 
     readings = recording_pressures(reconstructor, log, inputs)
     if readings.unused:
-        print(f"torchmembrane: {log}: {readings.unused} readings are of no frame of this call, and not used")
+        print(f"torchmembrane: {log}: {readings.unused} readings belong to no frame of this call and are not used")
     return readings.at
 
 

@@ -145,7 +145,7 @@ def _check_options(arguments: Namespace) -> None:
         return [name for name in names if getattr(arguments, name) is not None]
 
     if arguments.name == "sensor_rest":
-        raise MembraneError("--name sensor_rest: so is the sensor's rest image called; expected another name")
+        raise MembraneError("--name sensor_rest: the sensor's rest image has this name; expected another one")
     if arguments.random:
         if extra := given("depth", "slide", "path", "aim", "radius", "sides", "opening"):
             raise MembraneError(f"--{extra[0]} does not go with --random, whose presses are drawn")

@@ -98,8 +98,8 @@ def pictures(image: Image.Image) -> Iterator[int]:
             break
     if (told := _told(image)) > max(held, 1):
         raise MembraneError(
-            f"holds {told} pictures as ImageJ says there, and its directory leads to {held}; expected a page for each: save "
-            "it as a sequence of images, or as a TIFF with a page for each"
+            f"holds {told} images by its ImageJ description, but its directory has {held}; expected one page per image: save "
+            "it as a sequence of images, or as a TIFF with one page per image"
         )
 
 

@@ -178,7 +178,9 @@ def _grey_of(image: Image.Image, size: tuple[int, int] | None, bits: int | None)
     """Return the grey values of the current picture."""
     found = stored(image, size)
     if found.halved and bits is not None:
-        raise ValueError(f"its values are colour of 16 bits, of which 8 are read, so bits = {bits} is lost: save them as grey")
+        raise ValueError(
+            f"it is colour with 16 bits per channel, of which 8 are read, so bits = {bits} does not apply: save it as grey"
+        )
     return to_grey(found.values, found.bits or bits)
 
 

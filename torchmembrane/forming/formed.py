@@ -167,7 +167,7 @@ def _film(outline: Outline, cells: OutlineGrid) -> np.ndarray:
         if np.abs(w[free] - before).max() < FILM_SETTLED * outline.length:
             break
     else:
-        raise MembraneError("outline: no film without pressure was found in this rim; expected a rim that is less steep")
+        raise MembraneError("outline: no soap film was found in this rim; expected a less steep rim")
     return np.column_stack([x, w]).reshape(*cells.places.shape, 3)
 
 

@@ -146,7 +146,7 @@ def outline_of(points: ArrayLike) -> Outline:
     area = np.cross(centred, np.roll(centred, -1, 0)).sum(0) / 2
     if not np.linalg.norm(area) > LEAST_AREA * step.sum() ** 2:
         raise MembraneError(
-            "outline: the rim encloses hardly any area; expected points once around, in their order along the rim"
+            "outline: the rim encloses hardly any area; expected points in their order along the rim, once around"
         )
     if area[2] < 0:  # clockwise
         X, centred, area = X[::-1], centred[::-1], -area

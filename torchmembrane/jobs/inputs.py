@@ -122,7 +122,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
         if count > 1:
             twins = ", ".join(printable(str(path)) for path in paths if frame_name(path) == name)
             raise MembraneError(
-                f"two inputs have the name {name!r} ({twins}), as would their results: rename one, or use two calls"
+                f"two inputs have the name {name!r} ({twins}), and so would their results: rename one, or use two calls"
             )
     for image in inputs.images:
         if of_video := inputs.video_of(frame_name(image)):

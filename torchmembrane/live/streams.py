@@ -101,8 +101,8 @@ class ModelStream:
         known = self._session.mesh
         if known["sensor"] != sensor:
             raise MembraneError(
-                f"--model {path}: of another sensor, {known['name']!r} ({known['sensor'][:12]}, here {sensor[:12]}); expected "
-                "one that `torchmembrane export` made of this sensor file, grid included"
+                f"--model {path}: it belongs to another sensor, {known['name']!r} ({known['sensor'][:12]}, here {sensor[:12]}); "
+                "expected one that `torchmembrane export` made of this sensor file, grid included"
             )
         self.mesh = Mesh(**{key: value for key, value in known.items() if key in Mesh._fields})
         self._before: dict[str, np.ndarray] | None = None
@@ -124,7 +124,7 @@ class ModelStream:
         Raises:
             MembraneError: always, because the rest state is part of the model.
         """
-        raise MembraneError("rezero: an exported model has its rest state baked in; leave --model out, or export it again")
+        raise MembraneError("rezero: an exported model contains a fixed rest state; leave --model out, or export it again")
 
     def weigh(self, force: float) -> str:
         """Raise an error, as `gauge` does.

@@ -213,7 +213,7 @@ class Mesh(NamedTuple):
             if kind in (str, float) and not isinstance(getattr(self, name), kind):
                 raise ValueError(f"{name} is {type(getattr(self, name)).__name__}, not {kind.__name__}")
         if self.triangles.size and not 0 <= self.triangles.min() <= self.triangles.max() < V:
-            raise ValueError("its triangles have other corners than its vertices")
+            raise ValueError("its triangles refer to vertices that do not exist")
         if int(np.prod(self.grid)) != V or self.format not in FORMATS:
             raise ValueError(f"its grid is {self.grid.tolist()}, its format {self.format!r}")
 

@@ -66,6 +66,6 @@ def refuse_coincident(membrane: Membrane, positions: np.ndarray, names: Sequence
     if len(pairs):
         i, j = pairs[np.lexsort(pairs.T)[0]]
         raise MembraneError(
-            f"{names[j]} at {positions[j].tolist()} lies on that at {positions[i].tolist()} ({names[i]}); expected dots more "
-            f"than {limit:.3g} apart: remove one"
+            f"{names[j]} at {positions[j].tolist()} coincides with that at {positions[i].tolist()} ({names[i]}); expected dots "
+            f"more than {limit:.3g} apart: remove one"
         )

@@ -178,7 +178,7 @@ class Markers:
         alike = heights.ndim == 0 or bool((heights == heights[:1]).all())
         object.__setattr__(self, "height", float(heights.flat[0]) if alike and heights.size else heights)
         standing = self.kind == "dots" or not self.stand_off
-        expect(standing, "height", self.height, "none for texture, which lies on the surface: remove it")
+        expect(standing, "height", self.height, "no height for texture, which lies on the surface: remove it")
 
     @property
     def stand_off(self) -> bool:

@@ -207,7 +207,7 @@ def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
     if height < 0:
         raise table.refuse(HEIGHT, UPWARDS)
     if height and kind == "texture":
-        raise table.refuse(HEIGHT, "none for texture, which lies on the surface: remove it")
+        raise table.refuse(HEIGHT, "no height for texture, which lies on the surface: remove it")
     positions, sizes, lines, heights = _read_dots(dots) if dots else (None, None, [], None)
     if heights is not None and HEIGHT in table:
         raise table.refuse(HEIGHT, f"none, as {dots} has a column of that name: remove one of them")

@@ -227,7 +227,7 @@ def _check(folder: Path, settings: dict[str, Any]) -> None:
     try:
         before = dict(json.loads(read_text(folder / SETTINGS, MOST_SETTINGS_BYTES, "settings of `torchmembrane simulate`")))
         if missing := {"sensor", "grid"} - before.keys():
-            raise ValueError(f"it does not say the {min(missing)}")
+            raise ValueError(f"it does not state {min(missing)}")
     except DAMAGE as error:
         said = in_one_line(str(error).removeprefix(f"{folder / SETTINGS}: "))
         raise MembraneError(f"{folder / SETTINGS}: not readable ({said}); expected another folder") from error

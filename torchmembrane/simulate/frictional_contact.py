@@ -85,7 +85,7 @@ class FrictionalContact(NamedTuple):
         travel = along - x
         reached = (before < travel.norm(dim=-1)) & ((n_before * travel).sum(-1) > 0)
         if (reached & ((n_before * n_after).sum(-1) < SAME_SIDE)).any():
-            raise MembraneError("press: an indenter overtakes the membrane; expected smaller steps, which it can follow")
+            raise MembraneError("press: the indenter moves through the membrane in one step; expected smaller steps")
         met = (-after / (before - after).clamp_min(1e-300)).clamp(0, 1)
         share = torch.where(self.normal > 0, 1.0, met)[:, None]
         return self._replace(indenter=pose, tangential=self.tangential @ turn.T, anchor=x + share * travel)

@@ -124,6 +124,6 @@ def known_forces(arguments: Namespace, inputs: Inputs) -> KnownForces | None:
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:
     found = read_pressures(arguments.pressure, inputs, sensor)
     if found.unused:
-        print(f"{arguments.pressure}: {found.unused} readings are of none of the images, and not used")
+        print(f"{arguments.pressure}: {found.unused} readings belong to none of the images and are not used")
     readings = np.array([found.at(frame_name(path), time_in(path.stem)) for path in inputs.images])
     return KnownPressures(readings, found.since_rest)

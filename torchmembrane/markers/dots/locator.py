@@ -57,7 +57,7 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     inside = ndimage.binary_erosion(ndimage.binary_closing(inside, iterations=2), iterations=2)
     if not inside.any():
         raise MembraneError(
-            f"the membrane with its {len(pixels)} dots is not in the image of {width} x {height} px; expected it in the "
+            f"the membrane and its {len(pixels)} dots are not in the image of {width} x {height} px; expected it in the "
             "camera's view: check the camera's pose, centre and focal length"
         )
     return torch.as_tensor(inside, dtype=torch.float64)[None, None]
