@@ -331,7 +331,7 @@ def test_a_stream_by_a_model_gives_what_the_model_gives(model_file, tracking, re
     np.testing.assert_array_equal(stream.mesh.rest_vertices, reconstructor.estimator.membrane.rest.float().numpy())
     with pytest.raises(MembraneError, match="contains a fixed rest state"):
         stream.rezero()
-    with pytest.raises(MembraneError, match="it belongs to another sensor, 'cap'"):
+    with pytest.raises(MembraneError, match="belongs to another sensor, 'cap'"):
         ModelStream(model_file, 64 * "0")
     with pytest.raises(MembraneError, match="--model .*no such file"):
         ModelStream(tmp_path / "none.onnx", sensor)

@@ -126,7 +126,7 @@ def _told(sensor: Sensor, images: Tensor) -> tuple[np.ndarray, np.ndarray]:
             )
         if not deviations[i] < UNSURE:
             raise MembraneError(
-                f"calibrate material: image {i + 1} shows a force whose relative error is {100 * deviations[i]:.0f} %; expected "
-                "a weight that dents the membrane visibly: a heavier one"
+                f"calibrate material: image {i + 1} shows a force whose relative error is {100 * deviations[i]:.0f} %; "
+                "expected a weight that dents the membrane visibly: a heavier one"
             )
     return forces, deviations

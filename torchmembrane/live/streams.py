@@ -101,7 +101,7 @@ class ModelStream:
         known = self._session.mesh
         if known["sensor"] != sensor:
             raise MembraneError(
-                f"--model {path}: it belongs to another sensor, {known['name']!r} ({known['sensor'][:12]}, here {sensor[:12]}); "
+                f"--model {path}: belongs to another sensor, {known['name']!r} ({known['sensor'][:12]}, here {sensor[:12]}); "
                 "expected one that `torchmembrane export` made of this sensor file, grid included"
             )
         self.mesh = Mesh(**{key: value for key, value in known.items() if key in Mesh._fields})
