@@ -322,7 +322,7 @@ REFUSED = {
     "large_32.tif": (saved(WIDE.astype(np.int32) * 2, "TIFF"), "32-bit values from 0 to 120790; 8 or 16 bits are read"),
     "signed_16.tif": (tiff(WIDE // 2, kind=2), "its values are signed integers"),
     "list.jpg": (sequence("MPO").replace(b"MPF\0", b"MPF\0??", 1), "not readable as an image ("),
-    "planes_16.tif": (tiff([WIDE] * 3, photometric=2, planes=3), "colour or alpha of more than 8 bits"),
+    "planes_16.tif": (tiff([WIDE] * 3, photometric=2, planes=3), "colour or alpha with more than 8 bits"),
 }
 
 
@@ -441,7 +441,7 @@ def test_values_of_a_camera_of_fewer_bits_are_shares_of_its_white(bits, tmp_path
     for name in ("good", "eight"):
         np.testing.assert_allclose(seen(tmp_path / "r", name), TRUE, atol=0.51 / white)
     assert f"values up to {white + 1}; expected at most {white}, of the {bits} bits that the model states" in err
-    assert "rgb.png: colour or alpha of more than 8 bits" in err
+    assert "rgb.png: colour or alpha with more than 8 bits" in err
 
 
 def test_the_arrays_of_a_camera_of_12_bits_are_divided_too(edge, tmp_path):
