@@ -363,6 +363,12 @@ def test_gradients_are_exact(lens, ports):
     assert torch.autograd.gradcheck(camera.pixel_to_ray, pixels, atol=1e-6)
 
 
+@pytest.mark.parametrize("ports", ["port", "stack"])
+def test_second_derivatives_behind_ports_are_exact(ports):
+    camera, point = camera_of("fisheye", ports), torch.tensor([3.0, -2.0, 11.0], dtype=torch.float64)
+    assert torch.autograd.gradgradcheck(camera.point_to_pixel, point.requires_grad_(), atol=1e-6)
+
+
 class RayPoint(torch.nn.Module):
     """The point at t = 20 on a pixel's ray, as a forward that functional_call can reach."""
 

@@ -102,7 +102,7 @@ def shares_inside(name, lines, truth_lines, draws):
     return [float(((values - values.mean(0)).abs() < spread).double().mean()) for values, spread in found]
 
 
-@pytest.mark.parametrize("name", PRESSES)
+@pytest.mark.parametrize("name", [pytest.param("cap", marks=pytest.mark.full), "fingertip", "half cylinder"])
 def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(name):
     for inside in shares_inside(name, 13, truth_lines=17, draws=96):
         assert 0.60 < inside < 0.76
@@ -180,7 +180,7 @@ def test_deviations_are_of_the_weights_of_the_solve():
     stroke = Stroke(Sphere(4.0).touching(simulator.membrane, way), way, 1.5)
     (state,) = simulator.presses(stroke, ("push",))
     exact = torch.as_tensor(simulator.renderer.dots(state.vertices).pixels)
-    pixels = exact + noise * torch.randn(48, *exact.shape, generator=generator, dtype=torch.float64)
+    pixels = exact + noise * torch.randn(24, *exact.shape, generator=generator, dtype=torch.float64)
     with torch.no_grad():
         result = reconstructor.from_pixels(pixels)
         deviations = reconstructor.standard_deviations(result)
@@ -273,7 +273,8 @@ def test_the_gap_is_the_mean_distance_to_the_nearest_markers_that_are_seen():
 
 
 def test_pixels_as_noisy_as_they_are_said_to_be_are_explained():
-    reconstructor = Reconstructor(preset("bubble"))
+    sensor = preset("bubble")
+    reconstructor = Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
     u, v = 0.2 * torch.randn(2, *reconstructor.rest_pixels.shape, generator=torch.Generator().manual_seed(0))
     pixels, rest = reconstructor.rest_pixels + u, reconstructor.rest_pixels + v
     unsaid, said = (reconstructor.from_pixels(pixels, rest_pixels=rest, noise=noise) for noise in (None, 0.2))

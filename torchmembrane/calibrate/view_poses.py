@@ -189,26 +189,27 @@ def _overlays(expected: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
     """Where dots `[D, 2]` may be among those found `[K, 2]`: affine maps of the expected pixels, those that meet most first."""
     middle, pitch, tree = np.median(expected, 0), _pitch(found), cKDTree(found)
     grown = _extent(found) / _extent(expected)
-    tries = []
+    rows, tries = np.column_stack([expected, np.ones(len(expected))]), []
     for *step, turn in product(STEPS, STEPS, TURNS):
         c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
         over = np.median(found, 0) + pitch * np.array(step) + grown * (expected - middle) @ np.array([[c, s], [-s, c]])
+        before = None
         for _ in range(ROUNDS):
-            near, nearest = _each_other(over, found, tree)
-            if near.sum() < FEWEST_MARKERS:
+            partner = _partners(over, found, tree)
+            near = partner >= 0
+            if near.sum() < FEWEST_MARKERS or np.array_equal(partner, before):
                 break
-            rows = np.column_stack([expected, np.ones(len(expected))])
-            over = rows @ np.linalg.lstsq(rows[near], found[nearest[near]], rcond=None)[0]
-        tries.append((int(near.sum()), over))
-    return [over for _, over in sorted(tries, key=lambda each: -each[0])[:KEPT]]
+            over, before = rows @ np.linalg.lstsq(rows[near], found[partner[near]], rcond=None)[0], partner
+        tries.append((partner, over))
+    best = sorted(tries, key=lambda each: -(each[0] >= 0).sum())[:KEPT]
+    return list({partner.tobytes(): over for partner, over in best}.values())
 
 
-def _each_other(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the expected pixels `[D]` have a found one near, of which they are the nearest, and which one."""
+def _partners(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> np.ndarray:
+    """Which found pixel each of the expected ones has near, of which it is the nearest: `[D]`, -1 without one."""
     away, nearest = tree.query(expected)
-    near = away < NEAR * _pitch(expected)
     back = np.asarray(cKDTree(expected).query(found[nearest])[1])
-    return near & (back == np.arange(len(expected))), np.asarray(nearest)
+    return np.where((away < NEAR * _pitch(expected)) & (back == np.arange(len(expected))), nearest, -1)
 
 
 def _settled(
@@ -218,13 +219,17 @@ def _settled(
     where they are in the image."""
     tree, motion, score = cKDTree(pattern.pixels), np.zeros(6), 0.0
     both = len(np.unique(sizes)) == 2 == len(np.unique(pattern.sizes))
+    before = None
     for _ in range(ROUNDS):
-        near, nearest = _each_other(expected, pattern.pixels, tree)
+        partner = _partners(expected, pattern.pixels, tree)
+        near = partner >= 0
         if near.sum() < FEWEST_MARKERS:
             return 0.0, motion
-        motion = _pose(sensor, X[near], pivot, pattern.pixels[nearest[near]], motion)
+        if np.array_equal(partner, before):
+            break
+        motion, before = _pose(sensor, X[near], pivot, pattern.pixels[partner[near]], motion), partner
         expected = _seen(sensor, _turned(motion, X, pivot))
-        alike = sizes[near] == pattern.sizes[nearest[near]] if both else np.ones(near.sum(), bool)
+        alike = sizes[near] == pattern.sizes[partner[near]] if both else np.ones(near.sum(), bool)
         score = float(alike.sum() - (~alike).sum())
     return score, motion
 
