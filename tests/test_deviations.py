@@ -180,7 +180,7 @@ def test_deviations_are_of_the_weights_of_the_solve():
     stroke = Stroke(Sphere(4.0).touching(simulator.membrane, way), way, 1.5)
     (state,) = simulator.presses(stroke, ("push",))
     exact = torch.as_tensor(simulator.renderer.dots(state.vertices).pixels)
-    pixels = exact + noise * torch.randn(24, *exact.shape, generator=generator, dtype=torch.float64)
+    pixels = exact + noise * torch.randn(48, *exact.shape, generator=generator, dtype=torch.float64)
     with torch.no_grad():
         result = reconstructor.from_pixels(pixels)
         deviations = reconstructor.standard_deviations(result)
