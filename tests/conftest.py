@@ -1,8 +1,10 @@
 """Fixtures that several test files share."""
 
 import gc
+import pickle
 from dataclasses import replace
-from functools import partialmethod
+from functools import partialmethod, wraps
+from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from torchmembrane.calibrate import explained, presses
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.jobs import workers
+from torchmembrane.markers import placement
 from torchmembrane.markers.dots import pattern
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
@@ -60,22 +63,29 @@ def quick_processes(monkeypatch):
     context.set_forkserver_preload(["torchmembrane.reconstruct"])
     for module in (processes, workers):
         monkeypatch.setattr(module, "get_context", lambda _: context)
+    return context
+
+
+def once(function):
+    """The function, whose answer to the same arguments is computed once and copied from then on."""
+    found = {}
+
+    @wraps(function)
+    def copied(*given):
+        key = sha256(pickle.dumps(given)).digest()
+        if key not in found:
+            found[key] = pickle.dumps(function(*given))
+        return pickle.loads(found[key])
+
+    return copied
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _blobs_found_once():
-    """What is found in an image by the search for blobs, half a second of each `Reconstructor`, is kept for the next one."""
-    search, found = pattern.find_blobs, {}
-
-    def find_blobs(dark, mask=None):
-        key = dark.shape, dark.tobytes(), None if mask is None else mask.tobytes()
-        key = tuple(hash(part) for part in key)
-        if key not in found:
-            found[key] = search(dark, mask)
-        return tuple(field.copy() for field in found[key])
-
+def _dots_found_once():
+    """What is found in a rest image, half a second of each `Reconstructor`, is kept for the next one."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(pattern, "find_blobs", find_blobs)
+        patched.setattr(pattern, "find_blobs", once(pattern.find_blobs))
+        patched.setattr(placement, "measure_dots", once(placement.measure_dots))
         yield
 
 

@@ -1,6 +1,5 @@
 """A model around a reconstruction, trained by several processes."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,12 +40,8 @@ def gradients(model: nn.Module, pixels: torch.Tensor) -> list[torch.Tensor]:
 
 def train(rank: int, processes: int, folder: Path) -> None:
     """One of the processes: keeps the gradients that all find together."""
+    torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=processes)
     batch = torch.load(folder / "pixels.pt")
     torch.save(gradients(DistributedDataParallel(grasp()), batch[rank::processes]), folder / f"{rank}.pt")
     dist.destroy_process_group()
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    train(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))

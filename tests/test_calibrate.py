@@ -424,8 +424,8 @@ def test_the_public_names_are_loaded_when_asked_for():
     assert all(getattr(calibrate, name).__name__ == name for name in calibrate.__all__)
     with pytest.raises(AttributeError, match="no attribute 'lens_from_hearsay'"):
         _ = calibrate.lens_from_hearsay
-    code = "import sys, torchmembrane.calibrate; print('torch' in sys.modules, torchmembrane.calibrate.Views.__name__)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split() == ["False", "Views"]
+    code = "import sys, torchmembrane.calibrate; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split() == ["False"]
 
 
 # the command

@@ -8,6 +8,7 @@ import torch
 from scipy.optimize import minimize, minimize_scalar
 from torch.func import functional_call
 
+from torchmembrane.camera import distortion
 from torchmembrane.camera.distortion import distort
 from torchmembrane.camera.folds import fold_in_image, refuse_folds
 from torchmembrane.camera.model import Camera
@@ -180,13 +181,14 @@ def test_a_fold_that_is_cropped_away_is_none():
     assert fold_in_image(camera.in_mode((160, 120, 320, 240))) == math.inf
 
 
-def test_eight_coefficients_are_written_as_onnx():
+def test_eight_coefficients_are_written_as_onnx(monkeypatch):
     """The lens by itself, in batches, as the runtime of exported models computes it."""
     from onnxruntime import InferenceSession
 
     from torchmembrane.onnx.export import Piece
     from torchmembrane.onnx.trace import traced_model
 
+    monkeypatch.setattr(distortion, "LENS_STEPS", 5)  # each is written as the one before it
     camera = camera_of("pinhole k1-k6").float()
 
     class Lens(torch.nn.Module):
@@ -361,6 +363,12 @@ def test_gradients_are_exact(lens, ports):
     pixels = camera.point_to_pixel(points).detach().requires_grad_()
     assert torch.autograd.gradcheck(camera.point_to_pixel, points.requires_grad_(), atol=1e-6)
     assert torch.autograd.gradcheck(camera.pixel_to_ray, pixels, atol=1e-6)
+
+
+@pytest.mark.parametrize("ports", ["port", "stack"])
+def test_second_derivatives_behind_ports_are_exact(ports):
+    camera, point = camera_of("fisheye", ports), torch.tensor([3.0, -2.0, 11.0], dtype=torch.float64)
+    assert torch.autograd.gradgradcheck(camera.point_to_pixel, point.requires_grad_(), atol=1e-6)
 
 
 class RayPoint(torch.nn.Module):

@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchmembrane.estimators.force_balance.gauss_newton import GaussNewton
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergySettings
+from torchmembrane.machine_code import using
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 
@@ -72,6 +74,14 @@ def test_the_compiled_reconstruction_is_one_graph_and_agrees(estimator, way, set
     assert expected.displacement.norm(dim=-1).max() > 0.1
     for key, value in expected._asdict().items():
         torch.testing.assert_close(got._asdict()[key], value, rtol=1e-6, atol=1e-6, equal_nan=True)
+
+
+def test_a_step_returns_tensors_alone_or_torch_would_trace_each_anew(monkeypatch):
+    reconstructor, step, returned = example(settings=FEW), GaussNewton._nested_step, []
+    monkeypatch.setattr(GaussNewton, "_nested_step", lambda *given: returned.append(step(*given)) or returned[-1])
+    with torch.no_grad(), using(False):
+        reconstructor.from_pixels(reconstructor.rest_pixels)
+    assert returned and all(type(each) is tuple and {type(part) for part in each} == {torch.Tensor} for each in returned)
 
 
 def slope(function, at):

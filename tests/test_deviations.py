@@ -102,7 +102,7 @@ def shares_inside(name, lines, truth_lines, draws):
     return [float(((values - values.mean(0)).abs() < spread).double().mean()) for values, spread in found]
 
 
-@pytest.mark.parametrize("name", PRESSES)
+@pytest.mark.parametrize("name", [pytest.param("cap", marks=pytest.mark.full), "fingertip", "half cylinder"])
 def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(name):
     for inside in shares_inside(name, 13, truth_lines=17, draws=96):
         assert 0.60 < inside < 0.76
@@ -273,7 +273,8 @@ def test_the_gap_is_the_mean_distance_to_the_nearest_markers_that_are_seen():
 
 
 def test_pixels_as_noisy_as_they_are_said_to_be_are_explained():
-    reconstructor = Reconstructor(preset("bubble"))
+    sensor = preset("bubble")
+    reconstructor = Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
     u, v = 0.2 * torch.randn(2, *reconstructor.rest_pixels.shape, generator=torch.Generator().manual_seed(0))
     pixels, rest = reconstructor.rest_pixels + u, reconstructor.rest_pixels + v
     unsaid, said = (reconstructor.from_pixels(pixels, rest_pixels=rest, noise=noise) for noise in (None, 0.2))

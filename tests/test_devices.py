@@ -11,13 +11,16 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 import torchmembrane as tm
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergySettings
 
 CASES = [
-    ("force-balance", {}),
-    ("force-balance", dict(locator="soft")),
-    ("minimum-energy", {}),
+    pytest.param("force-balance", {}, marks=pytest.mark.full),
+    pytest.param("force-balance", dict(locator="soft"), marks=pytest.mark.full),
+    pytest.param("minimum-energy", {}, marks=pytest.mark.full),
+    ("minimum-energy", dict(locator="soft")),
     ("paper", {}),
 ]
+"""The others go through their estimators in `test_nothing_is_copied_to_the_device_for_a_frame` as well."""
 
 
 @pytest.fixture(scope="module")
@@ -28,22 +31,23 @@ def sensor():
 
 @pytest.fixture(params=[pytest.param("all steps", marks=pytest.mark.full), "few steps"])
 def settings(request, few_steps):
-    """Of force balance: each step is the same operations once more."""
-    return few_steps if request.param == "few steps" else None
+    """Of each estimator, by name: each step is the same operations once more."""
+    few = {"force-balance": few_steps, "minimum-energy": MinimumEnergySettings(steps=2)}
+    return few if request.param == "few steps" else {}
 
 
 @pytest.mark.parametrize(("estimator", "options"), CASES)
 def test_images_go_through_every_estimator(sensor, estimator, options, settings):
-    of_balance = settings if estimator == "force-balance" else None
-    reconstructor = tm.Reconstructor(sensor, estimator, settings=of_balance, **options).to("meta")
+    reconstructor = tm.Reconstructor(sensor, estimator, settings=settings.get(estimator), **options).to("meta")
     images = torch.empty(2, 480, 640, 3, dtype=torch.uint8, device="meta")
     result = reconstructor(images)
     assert {values.device.type for values in result} == {"meta"}
     assert result.vertices.shape == (2, 289, 3)
 
 
+@pytest.mark.full
 def test_frames_are_tracked_gauged_and_taken_from_markers(sensor, settings):
-    reconstructor = tm.Reconstructor(sensor, settings=settings).to("meta")
+    reconstructor = tm.Reconstructor(sensor, settings=settings.get("force-balance")).to("meta")
     images = torch.empty(2, 1, 480, 640, device="meta")
     first = reconstructor(images)
     followed = reconstructor(images, first, pressure=torch.empty(2, device="meta"))
@@ -68,11 +72,18 @@ class NoCopies(TorchFunctionMode):
 
 @pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])
 def test_nothing_is_copied_to_the_device_for_a_frame(sensor, few_steps, estimator):
+    """Neither for images, nor for what is tracked, gauged or taken from markers."""
     settings = few_steps if estimator == "force-balance" else None
     reconstructor = tm.Reconstructor(sensor, estimator, settings=settings).to("meta")
+    images = torch.empty(2, 480, 640, 3, dtype=torch.uint8, device="meta")
+    gauge = {"pressure": torch.empty(2, device="meta")} if reconstructor.finds_tractions else {}
     with NoCopies(), torch.no_grad():
-        first = reconstructor(torch.empty(2, 1, 480, 640, device="meta"))
-        reconstructor(torch.empty(2, 1, 480, 640, device="meta"), first)
+        first = reconstructor(images)
+        followed = reconstructor(images, first, **gauge)
+        located = reconstructor.from_pixels(first.pixels, first.confidence)
+    for result in (first, followed, located):
+        assert {values.device.type for values in result} == {"meta"}
+        assert result.vertices.shape == (2, 289, 3) and result.force.shape == (2, 3)
 
 
 def test_a_tensor_left_on_the_cpu_is_refused(sensor):

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import quickly_saving
 import torch
 from test_batch import CONTRACT, NPZ, PARQUET, Denting, grey_image, reconstruct, summary_of
 
@@ -324,13 +325,6 @@ def wait_for(condition, seconds=120):
 
 
 FRAMES = 40
-QUICKLY_SAVING = """
-import sys
-from torchmembrane.cli.main import main
-from torchmembrane.results import frame_table
-frame_table.SAVE_SECONDS = 0.0
-sys.exit(main(sys.argv[1:]))
-"""
 
 
 @pytest.mark.parametrize(
@@ -341,7 +335,9 @@ sys.exit(main(sys.argv[1:]))
         (signal.SIGKILL, "parquet", "1"),
     ],
 )
-def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_path, capsys, end, format, workers):
+def test_a_killed_command_keeps_what_is_done(
+    small_sensor, small_images, tmp_path, capsys, quick_processes, end, format, workers
+):
     (tmp_path / "images").mkdir()
     for k in range(FRAMES):
         (tmp_path / "images" / f"k{k:03d}.png").hardlink_to(small_images[k % 3])
@@ -352,13 +348,12 @@ def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_pat
     def done() -> int:
         return len(rows_in(out)) if format == "parquet" else len(list(out.glob("k*.npz")))
 
-    with subprocess.Popen(
-        [sys.executable, "-c", QUICKLY_SAVING, *command, workers], stderr=subprocess.PIPE, text=True
-    ) as process:
-        wait_for(lambda: done() > 0 or process.poll() is not None)
-        process.send_signal(end)
-        said = process.communicate()[1]
-    assert process.returncode == (143 if end == signal.SIGTERM else -signal.SIGKILL), said
+    process = quick_processes.Process(target=quickly_saving.command, args=([*command, workers], tmp_path / "said"))
+    process.start()
+    wait_for(lambda: done() > 0 or not process.is_alive())
+    os.kill(process.pid, end)
+    process.join()
+    assert process.exitcode == (143 if end == signal.SIGTERM else -signal.SIGKILL), (tmp_path / "said").read_text()
     kept = done()
     assert 0 < kept < FRAMES
     main([*command, "1"])

@@ -82,14 +82,15 @@ def taken(sensor, move):
     return simulator.leaves_camera(torch.where(free, move(rest), rest))
 
 
-PINHOLE = ("pinhole", (320, 320), (120.0, 120.0), (159.5, 159.5))
+PINHOLE = ("pinhole", (80, 80), (30.0, 30.0), (39.5, 39.5))
+SMALL = ("fisheye", (80, 80), (18.75, 18.75), (39.5, 39.5))
 DEEP = {
-    "fisheye within, at rest": (-2.0, FISHEYE, lambda x: x, False),
-    "fisheye within, pushed near": (-2.0, FISHEYE, lambda x: x * torch.tensor([1, 1, 0.1]), False),
-    "fisheye within, sideways behind": (-2.0, FISHEYE, lambda x: x - torch.tensor([0, 0, 1.5]), False),
-    "fisheye within, pushed over it": (-2.0, FISHEYE, lambda x: x - torch.tensor([0, 0, 14.0]), True),
-    "fisheye before, pushed over it": (4.0, FISHEYE, lambda x: x - torch.tensor([0, 0, 20.0]), True),
-    "fisheye before, pushed near": (4.0, FISHEYE, lambda x: x - torch.tensor([0, 0, 10.0]), False),
+    "fisheye within, at rest": (-2.0, SMALL, lambda x: x, False),
+    "fisheye within, pushed near": (-2.0, SMALL, lambda x: x * torch.tensor([1, 1, 0.1]), False),
+    "fisheye within, sideways behind": (-2.0, SMALL, lambda x: x - torch.tensor([0, 0, 1.5]), False),
+    "fisheye within, pushed over it": (-2.0, SMALL, lambda x: x - torch.tensor([0, 0, 14.0]), True),
+    "fisheye before, pushed over it": (4.0, SMALL, lambda x: x - torch.tensor([0, 0, 20.0]), True),
+    "fisheye before, pushed near": (4.0, SMALL, lambda x: x - torch.tensor([0, 0, 10.0]), False),
     "pinhole, pushed near": (4.0, PINHOLE, lambda x: x - torch.tensor([0, 0, 3.9]), False),
     "pinhole, pushed behind": (4.0, PINHOLE, lambda x: x - torch.tensor([0, 0, 5.0]), True),
 }

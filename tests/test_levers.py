@@ -179,9 +179,9 @@ def test_a_press_is_found_by_the_height_and_not_without_it(simulator, reconstruc
     assert blind[0] > 4 * surface and blind[1] > 4 * force
 
 
-def test_the_surface_has_gradients_in_the_pixels(reconstructor, press):
+def test_the_surface_has_gradients_in_the_pixels(reconstructor, press, few_steps):
     """By one difference: what steps of tips are solved by is differentiated too."""
-    made = tm.Reconstructor(reconstructor.sensor, dtype=torch.float64)
+    made = tm.Reconstructor(reconstructor.sensor, settings=few_steps, dtype=torch.float64)
     pixels = torch.from_numpy(press[0].truth["uv_deformed"]).double()
     rest = torch.from_numpy(press[0].truth["uv_nominal"]).double()
     way = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)

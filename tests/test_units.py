@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from moved_sensors import moved
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -134,6 +135,8 @@ def tours(tmp_path_factory):
                 patched.setattr(explained, "GRID", (9, 9))
                 patched.setattr(presses, "STRETCHES", np.geomspace(1.05, 1.7, 5))
                 patched.setattr(presses, "BETWEEN", 2)
+                if unit != "m":  # figures of each kind are drawn once
+                    patched.setattr(Figure, "draw", lambda *_: None)
                 made[unit] = Tour(unit, tmp_path_factory.mktemp(unit)).go(capsys)
         return made[unit]
 

@@ -191,26 +191,27 @@ def _overlays(expected: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
     """Return affine maps of the expected pixels `[D, 2]` that match found pixels `[K, 2]`, those with most matches first."""
     middle, pitch, tree = np.median(expected, 0), _pitch(found), cKDTree(found)
     grown = _extent(found) / _extent(expected)
-    tries = []
+    rows, tries = np.column_stack([expected, np.ones(len(expected))]), []
     for *step, turn in product(STEPS, STEPS, TURNS):
         c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
         over = np.median(found, 0) + pitch * np.array(step) + grown * (expected - middle) @ np.array([[c, s], [-s, c]])
+        before = None
         for _ in range(ROUNDS):
-            near, nearest = _each_other(over, found, tree)
-            if near.sum() < FEWEST_MARKERS:
+            partner = _partners(over, found, tree)
+            near = partner >= 0
+            if near.sum() < FEWEST_MARKERS or np.array_equal(partner, before):
                 break
-            rows = np.column_stack([expected, np.ones(len(expected))])
-            over = rows @ np.linalg.lstsq(rows[near], found[nearest[near]], rcond=None)[0]
-        tries.append((int(near.sum()), over))
-    return [over for _, over in sorted(tries, key=lambda each: -each[0])[:KEPT]]
+            over, before = rows @ np.linalg.lstsq(rows[near], found[partner[near]], rcond=None)[0], partner
+        tries.append((partner, over))
+    best = sorted(tries, key=lambda each: -(each[0] >= 0).sum())[:KEPT]
+    return list({partner.tobytes(): over for partner, over in best}.values())
 
 
-def _each_other(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
-    """Return which expected pixels have a mutual nearest neighbour nearby, `[D]` bool, and the index of each one's nearest."""
+def _partners(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> np.ndarray:
+    """Return the index of each expected pixel's mutual nearest neighbour among the found ones, `[D]`; -1 if none is nearby."""
     away, nearest = tree.query(expected)
-    near = away < NEAR * _pitch(expected)
     back = np.asarray(cKDTree(expected).query(found[nearest])[1])
-    return near & (back == np.arange(len(expected))), np.asarray(nearest)
+    return np.where((away < NEAR * _pitch(expected)) & (back == np.arange(len(expected))), nearest, -1)
 
 
 def _settled(
@@ -220,13 +221,17 @@ def _settled(
     size, and the pose."""
     tree, motion, score = cKDTree(pattern.pixels), np.zeros(6), 0.0
     both = len(np.unique(sizes)) == 2 == len(np.unique(pattern.sizes))
+    before = None
     for _ in range(ROUNDS):
-        near, nearest = _each_other(expected, pattern.pixels, tree)
+        partner = _partners(expected, pattern.pixels, tree)
+        near = partner >= 0
         if near.sum() < FEWEST_MARKERS:
             return 0.0, motion
-        motion = _pose(sensor, X[near], pivot, pattern.pixels[nearest[near]], motion)
+        if np.array_equal(partner, before):
+            break
+        motion, before = _pose(sensor, X[near], pivot, pattern.pixels[partner[near]], motion), partner
         expected = _seen(sensor, _turned(motion, X, pivot))
-        alike = sizes[near] == pattern.sizes[nearest[near]] if both else np.ones(near.sum(), bool)
+        alike = sizes[near] == pattern.sizes[partner[near]] if both else np.ones(near.sum(), bool)
         score = float(alike.sum() - (~alike).sum())
     return score, motion
 

@@ -14,6 +14,7 @@ from ..errors import expect
 
 MOST_INDEX, FARTHEST = 5.0, 1e6  # refractive index; length unit
 PORT_STEPS = 10  # Newton steps to the refracted ray of a point
+DERIVATIVES = 2  # how many derivatives of that ray are exact, and how many of these steps are differentiated
 
 
 class Port(NamedTuple):
@@ -99,7 +100,8 @@ def apparent_points(points: Tensor, layers: Layers, medium_index: Tensor) -> Ten
 
     With rho the distance from the axis and w = tan(angle in air) / rho, Snell's law is `g(w) = 0`,
     `g(w) = sum_i h_i w / sqrt(n_i^2 + (n_i^2 - 1) rho^2 w^2) - 1`, concave and increasing for n_i >= 1, and
-    g(1 / z) <= 0: Newton from 1 / z is monotone.
+    g(1 / z) <= 0: Newton from 1 / z is monotone. At the root, the derivative of a Newton step with respect to w is 0, so that k
+    steps from there have the first k derivatives of w with respect to all else; the steps before are not differentiated.
 
     Args:
         points: `[..., 3]`, length unit, camera frame.
@@ -116,13 +118,21 @@ def apparent_points(points: Tensor, layers: Layers, medium_index: Tensor) -> Ten
     heights = torch.cat([layers.heights.expand(*depth.shape[:-1], -1), depth], -1)
     squared = torch.cat([layers.indices, medium_index[None]]) ** 2
     rho_squared = (xy * xy).sum(-1, keepdim=True)
-    w = 1 / torch.where(behind, z, 1.0)
-    for _ in range(PORT_STEPS):
+    terms = heights, squared, rho_squared
+    start = 1 / torch.where(behind, z, 1.0)
+    w = _newton(start.detach(), PORT_STEPS - DERIVATIVES, *(term.detach() for term in terms))
+    w = _newton(w, DERIVATIVES, *terms)
+    return torch.where(behind, torch.cat([xy * w, torch.ones_like(w)], -1), math.nan)
+
+
+def _newton(w: Tensor, steps: int, heights: Tensor, squared: Tensor, rho_squared: Tensor) -> Tensor:
+    """Return `w` after steps towards the root of g, with the squares of the indices and of rho."""
+    for _ in range(steps):
         optical = (squared + (squared - 1) * rho_squared * w * w).rsqrt()
         value = (heights * optical).sum(-1, keepdim=True) * w - 1
         slope = (heights * squared * optical**3).sum(-1, keepdim=True)
         w = w - value / slope
-    return torch.where(behind, torch.cat([xy * w, torch.ones_like(w)], -1), math.nan)
+    return w
 
 
 def check_ports(owner: str, ports: Sequence[Sequence[float]]) -> None:

@@ -227,13 +227,16 @@ class GaussNewton(nn.Module):
             *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
             return State(*after), weights
         numbers = Scales(*(scale if isinstance(scale, Tensor) else state.u.new_full((), scale) for scale in scales))
-        step = self.step if torch.compiler.is_exporting() or torch.is_grad_enabled() else self._nested_step
-        taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
-        return taken
+        if torch.compiler.is_exporting() or torch.is_grad_enabled():
+            return self.step(state, weights, measured, numbers)
+        *after, weights = self._nested_step(state, weights, measured, numbers)
+        return State(*after), weights
 
     @torch.compiler.nested_compile_region
-    def _nested_step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
-        return self.step(state, weights, measured, scales)
+    def _nested_step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[Tensor, ...]:
+        """Return the tensors of `step` in a plain tuple: torch 2.13 traces a region that returns named tuples at every call."""
+        after, weights = self.step(state, weights, measured, scales)
+        return *after, weights
 
     def step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
         """Take one reweighted Gauss-Newton step with linearised volume, limiting the longest step of a vertex.

@@ -51,9 +51,10 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     kept = np.append(longest < 3 * pitch, False)
     place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
     triangle = triangulation.find_simplex(place)
-    distance, dot = cKDTree(pixels).query(place)
     of_dot = np.append((triangulation.simplices < len(pixels)).any(1), False)
-    inside = kept[triangle] | (of_dot[triangle] & (distance < REACH * spacing(pixels)[1][dot]))
+    inside, long = kept[triangle], (of_dot & ~kept)[triangle]
+    distance, dot = cKDTree(pixels).query(place[long])
+    inside[long] = distance < REACH * spacing(pixels)[1][dot]
     inside = ndimage.binary_erosion(ndimage.binary_closing(inside, iterations=2), iterations=2)
     if not inside.any():
         raise MembraneError(
