@@ -703,3 +703,10 @@ def test_a_dot_whose_middle_leaves_the_image_is_lost_though_its_edge_is_seen(bey
     gone = moved[:, 0] < 0
     assert gone.sum() == 5 and (confidence[0, gone] < 0.5).all() and (confidence[0, ~gone] > 0.5).all()
     assert np.linalg.norm(pixels[0].numpy() - moved, axis=1)[~gone].max() < 0.3
+
+
+def test_a_blob_that_is_probably_no_dot_costs_the_logarithm_of_its_probability():
+    match = DotMatcher(scene().pixels, np.zeros(len(scene().pixels)), 0.45, np.ones(len(scene().pixels), bool)).double()
+    radius, valid = torch.tensor([[0.0, 0.3, -0.2]]).double(), torch.tensor([[1.0, 0.6, 0.02]]).double()
+    more = match.misfit(radius, valid) - match.misfit(radius, torch.ones_like(valid))
+    torch.testing.assert_close(more, (-2 * valid.log())[:, None].expand_as(more))

@@ -5,8 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from ..spacing import neighbours, safe_length
-
-NEIGHBOURS = 6
+from .scales import NEIGHBOURS
 
 
 class NeighbourSteps(nn.Module):
