@@ -113,7 +113,7 @@ def test_the_frame_is_judged_alone_as_in_a_batch():
 
 def test_a_tear_is_told_as_an_exponential_distribution_from_a_uniform_one():
     tear = np.array([0.0, 0.01, 0.1])
-    expected = stats.expon(scale=p.TEAR).logpdf(tear) - stats.uniform(0, 1).logpdf(tear)
+    expected = stats.expon(scale=p.TEAR).logpdf(tear) - stats.uniform(0, 1).logpdf(tear) - np.log(p.LOST)
     np.testing.assert_allclose(p.whole_evidence(torch.tensor(tear)), expected, atol=1e-9)
 
 

@@ -6,8 +6,6 @@ import numpy as np
 from scipy import fft, ndimage
 
 from ...errors import MembraneError
-from .ellipse import SOFTNESS
-from .scales import SHADE
 
 SCALES = 1.25  # ratio of neighbouring scales
 SMALLEST = 1.2  # px, radius of the smallest dot looked for
@@ -89,7 +87,7 @@ def grow_blob(dark: np.ndarray, seed: np.ndarray, radius: float) -> Blob | None:
     core = patch[distance <= max(0.5 * radius, 1)].mean()
     around = patch[(distance > 1.5 * radius + 1) & (distance < 2.4 * radius + 2)]
     background = np.median(around) if around.size else core
-    if background - core < SHADE:
+    if background - core < 0.04:
         return None
     labels, _ = ndimage.label(patch < (core + background) / 2)
     label = labels[seed[1] - v0, seed[0] - u0]
@@ -99,7 +97,7 @@ def grow_blob(dark: np.ndarray, seed: np.ndarray, radius: float) -> Blob | None:
     position = np.stack([u[blob] + u0, v[blob] + v0], -1).astype(float)
     centre = position.mean(0)
     moments = (position - centre).T @ (position - centre) / len(position) + np.eye(2) / 12
-    return Blob(len(position), centre, moments, (background - core) / max(background, SHADE))
+    return Blob(len(position), centre, moments, (background - core) / max(background, 0.05))
 
 
 def is_dot(area: float, moments: np.ndarray, filled: float) -> bool:
@@ -134,7 +132,7 @@ def find_blobs(dark: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.nda
     Raises:
         MembraneError: fewer than 6 are found.
     """
-    smooth = ndimage.gaussian_filter(dark, SOFTNESS)
+    smooth = ndimage.gaussian_filter(dark, 0.6)
     taken = np.zeros(dark.shape, bool)
     blobs = []
     for seed, radius in zip(*blob_seeds(smooth), strict=True):

@@ -20,7 +20,7 @@ CONTRAST_DEVIATION = 0.22
 """Standard deviation of the contrasts of dots, and of what is none, over that of the clearer dots."""
 STEP_DEVIATION = 0.12
 """Standard deviation of the steps between neighbours that are found, over their lengths."""
-TEAR = 0.01
+TEAR = 0.005
 """Of a whole pattern, the mean of what `Seams` measures."""
 LEAST = 1e-6
 """Keeps logarithms finite."""
@@ -68,13 +68,14 @@ def own_evidence(found: Tensor, error: Tensor) -> Tensor:
 def whole_evidence(tear: Tensor) -> Tensor:
     """Log odds of a pattern that is whole around a dot against one that is torn, by what `Seams` measures `[B, D]`.
 
-    Of a whole one this is distributed exponentially with mean `TEAR`; of a torn one it may be anything in 0..1.
+    Of a whole one this is distributed exponentially with mean `TEAR`; of a torn one it may be anything in 0..1. The odds of a
+    torn one to begin with are `LOST`.
 
     Example:
         >>> [round(x, 1) for x in whole_evidence(torch.tensor([0.0, 0.046, 0.09])).tolist()]
-        [4.6, 0.0, -4.4]
+        [9.2, 0.0, -8.8]
     """
-    return -math.log(TEAR) - tear / TEAR
+    return -math.log(LOST * TEAR) - tear / TEAR
 
 
 def probability(*evidence: Tensor) -> Tensor:
