@@ -38,8 +38,8 @@ def test_a_dot_and_none_are_alike_where_schwarz_finds_them_equal():
 
 def test_contrasts_are_told_apart_as_two_normal_distributions():
     contrast = np.linspace(-0.5, 1.5, 9)
-    right, wrong = (stats.norm(p.FAINT + side, p.CONTRAST_DEVIATION).logpdf(contrast) for side in (0.5, -0.5))
-    np.testing.assert_allclose(p.contrast_evidence(torch.tensor(contrast)), right - wrong, atol=1e-9)
+    right, wrong = (stats.norm(0.4 + side, p.CONTRAST_DEVIATION).logpdf(contrast) for side in (0.5, -0.5))
+    np.testing.assert_allclose(p.contrast_evidence(torch.tensor(contrast), 0.4), right - wrong, atol=1e-9)
 
 
 def test_right_steps_are_normal_and_wrong_ones_uniform_in_the_plane():

@@ -6,8 +6,9 @@ from torch import Tensor, nn
 
 from ...control_flow import fori_loop, traced
 from ..spacing import FADED, neighbours, spacing, square_distance
-from .scales import CANDIDATES, FAR, NEIGHBOURS, NONE, PREDICTION, RIDGE
+from .scales import CANDIDATES, FAR, NEIGHBOURS, NONE, RIDGE
 
+WIDTH = 0.2  # pitches, within which a neighbour's blob lies from where a deformation puts it
 AVERAGE = 0.8  # pitches, over which a deformation is averaged
 FITS = 6  # of a deformation to the blobs around
 
@@ -90,10 +91,10 @@ class LocalDeformation(nn.Module):
     def refine(
         self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor
     ) -> tuple[Tensor]:
-        """The gradient after another fit, with blobs believed up to about `PREDICTION` pitches off; the rest as of `begin`."""
+        """The gradient after another fit, with blobs believed up to about `WIDTH` pitches off; the rest as of `begin`."""
         a, b, c, d = gradient.flatten(1, 2).unbind(1)
         entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
-        mapped = (entries * (-0.5 / PREDICTION**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
+        mapped = (entries * (-0.5 / WIDTH**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
         target = beside @ torch.exp((away.mT @ mapped).clamp_min(-FADED))
         target = target / (target[:, :, 2:] + NONE)  # weight times position, weight: [B, K, 3, M]
         sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))

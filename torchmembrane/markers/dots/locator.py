@@ -20,7 +20,7 @@ from .native_flow import KEPT_STEPS
 from .pattern import DotPattern
 from .probability import LEAST, alone, among_neighbours, contrast_evidence, whole_evidence
 from .pyramid import mean_pyramid
-from .scales import REACH, STEPS
+from .scales import FAINT, REACH, STEPS
 from .seams import Seams
 
 DIGITS = 8.0  # float32 has 20 binary ones after the point beside it
@@ -194,7 +194,7 @@ class DotLocator(nn.Module):
         blobs, log_radius, strength = self.detect(levels)
         relative = strength / self.strength[self.match.nearest_dots(blobs)]
         level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True).clamp_min(LEAST)
-        valid = torch.sigmoid(contrast_evidence(relative / level))
+        valid = torch.sigmoid(contrast_evidence(relative / level, FAINT))
         level_0, level_1, level_2 = levels
         start = self._alike(blobs, BLOB), self._alike(log_radius, SHARE), self._alike(valid, SHARE)
         return level_0, level_1, level_2, *start

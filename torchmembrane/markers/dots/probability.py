@@ -10,17 +10,19 @@ import torch
 from torch import Tensor
 
 from .fit import FittedDots
-from .scales import FAINT, LOST, PREDICTION, SHADE
+from .scales import LOST, PREDICTION, SHADE
 
 PIXELS = 10.0
 """Pixels of a window that each say something of their own: what a fit leaves over comes in clumps, unlike noise."""
 PARAMETERS = 4.0
 """Of a dot, beyond its background: contrast, place and size."""
+HALF_CONTRAST = 0.5
+"""Contrast, over that of the frame's clearer dots, of what is as likely a dot as none: the middle of 0 and 1."""
 CONTRAST_DEVIATION = 0.22
 """Standard deviation of the contrasts of dots, and of what is none, over that of the clearer dots."""
 STEP_DEVIATION = 0.12
 """Standard deviation of the steps between neighbours that are found, over their lengths."""
-TEAR = 0.005
+TEAR = 0.004
 """Of a whole pattern, the mean of what `Seams` measures."""
 LEAST = 1e-6
 """Keeps logarithms finite."""
@@ -38,16 +40,16 @@ def dot_evidence(explained: Tensor) -> Tensor:
     return -0.5 * PIXELS * (1 - explained).clamp_min(LEAST).log() - 0.5 * PARAMETERS * math.log(PIXELS)
 
 
-def contrast_evidence(contrast: Tensor) -> Tensor:
+def contrast_evidence(contrast: Tensor, middle: float = HALF_CONTRAST) -> Tensor:
     """Log odds of a dot against something fainter, from its contrast over that of the frame's clearer dots.
 
-    Both are normal, with `CONTRAST_DEVIATION` and 1 apart; `FAINT` is the middle between them.
+    Both are normal, with `CONTRAST_DEVIATION` and 1 apart, about `middle`.
 
     Example:
-        >>> contrast_evidence(torch.tensor([1.0, 0.35, 0.0])).round().tolist()
-        [13.0, 0.0, -7.0]
+        >>> contrast_evidence(torch.tensor([1.0, 0.5, 0.0])).round().tolist()
+        [10.0, 0.0, -10.0]
     """
-    return (contrast - FAINT) / CONTRAST_DEVIATION**2
+    return (contrast - middle) / CONTRAST_DEVIATION**2
 
 
 def own_evidence(found: Tensor, error: Tensor) -> Tensor:
@@ -72,8 +74,8 @@ def whole_evidence(tear: Tensor) -> Tensor:
     torn one to begin with are `LOST`.
 
     Example:
-        >>> [round(x, 1) for x in whole_evidence(torch.tensor([0.0, 0.046, 0.09])).tolist()]
-        [9.2, 0.0, -8.8]
+        >>> [round(x, 1) for x in whole_evidence(torch.tensor([0.0, 0.038, 0.08])).tolist()]
+        [9.4, -0.1, -10.6]
     """
     return -math.log(LOST * TEAR) - tear / TEAR
 

@@ -8,12 +8,13 @@ REACH = 2.5
 """Of a dot from where it is expected, and of an edge between neighbours."""
 PREDICTION = 0.3
 """Standard deviation of where neighbours predict a dot, and of a step between them over its length."""
-NEIGHBOURS = 6
-"""Of a dot, whose arrangement and steps are compared with those at rest."""
+NEIGHBOURS = 8
+"""Of a dot, whose arrangement, steps, sizes and contrasts are compared: all that surround it in a square pattern."""
 CANDIDATES = int(math.pi * REACH**2)
 """Blobs among which a dot chooses, and for whose shifts it votes: as many as lie within `REACH`."""
 FAINT = 0.35
-"""Contrast, over that of the frame's clearer dots, of what is as likely a dot as none."""
+"""Strength of a blob, over that of the frame's clearer ones, that is as likely a dot as none; over the dots' contrast, that of
+what stands out."""
 SHADE = 0.05
 """Contrast of dirt and shade in any frame."""
 LOST = 0.02
