@@ -16,8 +16,6 @@ PIXELS = 10.0
 """Pixels of a window that each say something of their own: what a fit leaves over comes in clumps, unlike noise."""
 PARAMETERS = 4.0
 """Of a dot, beyond its background: contrast, place and size."""
-HALF_CONTRAST = 0.5
-"""Contrast, over that of the frame's clearer dots, of what is as likely a dot as none: the middle of 0 and 1."""
 CONTRAST_DEVIATION = 0.22
 """Standard deviation of the contrasts of dots, and of what is none, over that of the clearer dots."""
 STEP_DEVIATION = 0.12
@@ -40,10 +38,10 @@ def dot_evidence(explained: Tensor) -> Tensor:
     return -0.5 * PIXELS * (1 - explained).clamp_min(LEAST).log() - 0.5 * PARAMETERS * math.log(PIXELS)
 
 
-def contrast_evidence(contrast: Tensor, middle: float = HALF_CONTRAST) -> Tensor:
+def contrast_evidence(contrast: Tensor, middle: float = 0.5) -> Tensor:
     """Log odds of a dot against something fainter, from its contrast over that of the frame's clearer dots.
 
-    Both are normal, with `CONTRAST_DEVIATION` and 1 apart, about `middle`.
+    Both are normal, with `CONTRAST_DEVIATION` and 1 apart, about `middle`: of what is none about 0, of dots about 1.
 
     Example:
         >>> contrast_evidence(torch.tensor([1.0, 0.5, 0.0])).round().tolist()

@@ -9,7 +9,7 @@ REACH = 2.5
 PREDICTION = 0.3
 """Standard deviation of where neighbours predict a dot, and of a step between them over its length."""
 NEIGHBOURS = 8
-"""Of a dot, whose arrangement, steps, sizes and contrasts are compared: all that surround it in a square pattern."""
+"""Of a dot, whose arrangement, sizes and contrasts are compared: all that surround it in a square pattern."""
 CANDIDATES = int(math.pi * REACH**2)
 """Blobs among which a dot chooses, and for whose shifts it votes: as many as lie within `REACH`."""
 FAINT = 0.35

@@ -5,7 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from ..spacing import neighbours, safe_length
-from .scales import NEIGHBOURS
+
+NEIGHBOURS = 6  # nearest, to which a dot's steps are compared with those at rest
 
 
 class NeighbourSteps(nn.Module):
