@@ -389,6 +389,14 @@ def test_dots_that_took_anothers_blob_are_let_go_and_find_their_own():
     assert confidence.min() > 0.5 and np.linalg.norm(pixels.numpy() - truth, axis=-1).max() < 0.5
 
 
+def test_dots_smeared_over_half_the_spacing_are_found(two):
+    """A camera in motion; the deformation that neighbours show is then blurred as well."""
+    s, locate = two
+    pixels, confidence, _ = locate(batch(ndimage.uniform_filter1d(render(s.pixels, s.shapes, noise=0), 13, axis=1)))
+    error = np.linalg.norm(pixels[0].numpy() - s.pixels, axis=1)[confidence[0].numpy() > 0.5]
+    assert len(error) > 0.9 * len(s.pixels) and error.max() < PITCH / 4
+
+
 @pytest.mark.parametrize(
     "off, lost, believed", [(0.3, True, False), (0.3, False, True), (0.0, True, True), (0.7, False, False)]
 )
