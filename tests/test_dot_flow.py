@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from torchmembrane.markers.dots.flow import FlowAverages
+from torchmembrane.markers.dots.scales import RIDGE
 from torchmembrane.markers.spacing import thin_out
 from torchmembrane.solve.elimination import solve_dense, solve_positive
 
@@ -17,7 +18,7 @@ ANCHORS = np.stack([np.arange(-20.0, 80.0, 5.0), np.full(20, EDGE)], -1)
 @pytest.fixture(scope="module")
 def sheared():
     """Averages around uneven dots beside a fixed edge; a flow that is affine and vanishes there, and its gradient."""
-    averages = FlowAverages(PIXELS, np.concatenate([PIXELS, ANCHORS]), 1.1)
+    averages = FlowAverages(PIXELS, np.concatenate([PIXELS, ANCHORS]))
     slope = torch.tensor([0.3, -0.2], dtype=torch.float64)
     gradient = torch.stack([torch.zeros(2, dtype=torch.float64), slope], 1)
     flow = slope[:, None] * torch.tensor(PIXELS[:, 1] - EDGE)
@@ -48,8 +49,8 @@ def test_the_gradient_is_that_of_the_least_squares_fit(sheared):
     nodes = np.concatenate([PIXELS, ANCHORS])
     y = np.column_stack([np.ones(len(nodes)), (nodes - nodes[dot]) / averages.h[dot].item()])
     values = np.concatenate([flow[0].T.numpy(), np.zeros((len(ANCHORS), 2))])
-    ridge, drawn = np.diag([1e-3, 0.5, 0.5]), np.zeros((3, 2))
-    drawn[1:] = 0.5 * averages.h[dot].item() * prior[0, ..., dot].T.numpy()
+    ridge, drawn = np.diag([1e-3, RIDGE, RIDGE]), np.zeros((3, 2))
+    drawn[1:] = RIDGE * averages.h[dot].item() * prior[0, ..., dot].T.numpy()
     expected = np.linalg.solve(y.T * kernel @ y + ridge, y.T * kernel @ values + drawn)[1:].T / averages.h[dot].item()
     np.testing.assert_allclose(averages.gradient(weight, flow, prior)[0, ..., dot], expected, rtol=1e-9)
 
@@ -57,7 +58,7 @@ def test_the_gradient_is_that_of_the_least_squares_fit(sheared):
 def test_no_weight_is_subnormal():
     """A product with subnormal numbers takes fifty times as long; dots so far apart have nothing to say of one another."""
     pixels = 12.0 * np.stack(np.meshgrid(np.arange(30), np.arange(3)), -1).reshape(-1, 2)
-    for name, buffer in FlowAverages(pixels, pixels, 1.1).float().named_buffers():
+    for name, buffer in FlowAverages(pixels, pixels).float().named_buffers():
         size = buffer.abs()
         assert not ((size > 0) & (size < torch.finfo(torch.float32).tiny)).any(), name
 

@@ -389,6 +389,14 @@ def test_dots_that_took_anothers_blob_are_let_go_and_find_their_own():
     assert confidence.min() > 0.5 and np.linalg.norm(pixels.numpy() - truth, axis=-1).max() < 0.5
 
 
+def test_dots_smeared_over_half_the_spacing_are_found(two):
+    """A camera in motion; the deformation that neighbours show is then blurred as well."""
+    s, locate = two
+    pixels, confidence, _ = locate(batch(ndimage.uniform_filter1d(render(s.pixels, s.shapes, noise=0), 13, axis=1)))
+    error = np.linalg.norm(pixels[0].numpy() - s.pixels, axis=1)[confidence[0].numpy() > 0.5]
+    assert len(error) > 0.9 * len(s.pixels) and error.max() < PITCH / 4
+
+
 @pytest.mark.parametrize(
     "off, lost, believed", [(0.3, True, False), (0.3, False, True), (0.0, True, True), (0.7, False, False)]
 )
@@ -703,3 +711,10 @@ def test_a_dot_whose_middle_leaves_the_image_is_lost_though_its_edge_is_seen(bey
     gone = moved[:, 0] < 0
     assert gone.sum() == 5 and (confidence[0, gone] < 0.5).all() and (confidence[0, ~gone] > 0.5).all()
     assert np.linalg.norm(pixels[0].numpy() - moved, axis=1)[~gone].max() < 0.3
+
+
+def test_a_blob_that_is_probably_no_dot_costs_the_logarithm_of_its_probability():
+    match = DotMatcher(scene().pixels, np.zeros(len(scene().pixels)), 0.45, np.ones(len(scene().pixels), bool)).double()
+    radius, valid = torch.tensor([[0.0, 0.3, -0.2]]).double(), torch.tensor([[1.0, 0.6, 0.02]]).double()
+    more = match.misfit(radius, valid) - match.misfit(radius, torch.ones_like(valid))
+    torch.testing.assert_close(more, (-2 * valid.log())[:, None].expand_as(more))

@@ -32,7 +32,7 @@ def both(function, *given):
 @pytest.mark.parametrize("anchored", [False, True])
 def test_gradient_and_flow_are_those_of_tensor_operations(anchored):
     anchors = np.array([[-20.0, 10.0], [130.0, 40.0]]) if anchored else np.zeros((0, 2))
-    averages = FlowAverages(PIXELS, np.concatenate([PIXELS, anchors]), 1.1).float()
+    averages = FlowAverages(PIXELS, np.concatenate([PIXELS, anchors])).float()
     weight, flow, strain = weights(), field(2, size=5.0), field(2, 2, size=0.1)
     torch.testing.assert_close(*both(averages.gradient, weight, flow, strain), rtol=1e-4, atol=1e-4)
     found, wanted = both(averages.along, weight, flow, strain)
@@ -56,14 +56,14 @@ def test_choices_are_those_of_tensor_operations():
 
 
 def test_what_records_gradients_is_left_to_tensors():
-    averages = FlowAverages(PIXELS, PIXELS, 1.1).float()
+    averages = FlowAverages(PIXELS, PIXELS).float()
     flow = field(2).requires_grad_()
     averages.gradient(weights(), flow, field(2, 2)).sum().backward()
     assert float(flow.grad.abs().max()) > 0
 
 
 def test_a_frame_of_nan_changes_no_other_and_no_frame_gives_none():
-    averages = FlowAverages(PIXELS, PIXELS, 1.1).float()
+    averages = FlowAverages(PIXELS, PIXELS).float()
     given = weights(), field(2, size=5.0), field(2, 2, size=0.1)
     spoiled = [torch.cat([value[:1], torch.full_like(value[1:2], torch.nan), value[2:]]) for value in given]
     for function in (averages.gradient, lambda *values: averages.along(*values)[0]):

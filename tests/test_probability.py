@@ -46,13 +46,38 @@ def test_right_steps_are_normal_and_wrong_ones_uniform_in_the_plane():
     error, found = np.linspace(0, 0.5, 6), np.linspace(0, 1, 6)
     right = stats.multivariate_normal(np.zeros(2), p.STEP_DEVIATION**2).logpdf(np.stack([error, 0 * error], -1))
     prior = np.log((found + p.LOST) / (1 - found + p.LOST))
-    expected = prior + right + np.log(np.pi * p.WRONG_STEP**2)
+    expected = prior + right + np.log(np.pi * p.PREDICTION**2)
     np.testing.assert_allclose(p.own_evidence(torch.tensor(found), torch.tensor(error)), expected, atol=1e-9)
 
 
 def test_the_probability_is_one_over_one_and_all_odds_against():
     evidence = torch.randn(3, 2, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     torch.testing.assert_close(p.probability(*evidence), 1 / (1 + (-evidence).exp().sum(0)))
+
+
+def test_a_dot_has_the_odds_of_its_window_its_contrast_its_size_and_its_neighbours_against_it():
+    """Contrasts count over the mean of the clearer half and `SHADE`; each further explanation adds its odds."""
+    generator = np.random.default_rng(0)
+    explained, contrast, found, error, other = (generator.uniform(0.1, 0.8, (2, len(REST))) for _ in range(5))
+    misfit, one = generator.uniform(0, 9, (2, len(REST))), np.ones((2, len(REST)))
+    seen = dots(torch.tensor(explained), torch.tensor(contrast))._replace(misfit=torch.tensor(misfit))
+    level = np.sort(contrast, 1)[:, len(REST) // 2 :].mean(1, keepdims=True) + p.SHADE
+    window = p.dot_evidence(torch.tensor(explained)).numpy(), p.contrast_evidence(torch.tensor(contrast / level)).numpy()
+    for own, others, got in (
+        ((one, 0 * one), (), p.alone(seen)),
+        ((found, error), (other,), p.among_neighbours(seen, *map(torch.tensor, (found, error, other)))),
+    ):
+        size = p.own_evidence(*map(torch.tensor, own)).numpy() - misfit / 2
+        np.testing.assert_allclose(got, 1 / (1 + sum(np.exp(-x) for x in (*window, size, *others))), atol=1e-9)
+
+
+def test_the_error_of_a_step_is_over_its_length():
+    """A pattern stretched by a tenth, its dots unevenly spaced, has that error everywhere."""
+    uneven = REST + np.random.default_rng(0).uniform(-6, 6, REST.shape)
+    one, flat = torch.ones(1, len(REST), dtype=torch.float64), torch.zeros(1, 2, 2, len(REST), dtype=torch.float64)
+    share, error = NeighbourSteps(uneven, np.ones(len(REST), bool))(torch.tensor(1.1 * uneven.T)[None], one, flat)
+    torch.testing.assert_close(error, 0.1 * one)
+    torch.testing.assert_close(share, one)
 
 
 def test_what_is_seen_clearly_among_its_neighbours_is_believed():
@@ -88,7 +113,7 @@ def test_the_frame_is_judged_alone_as_in_a_batch():
 
 def test_a_tear_is_told_as_an_exponential_distribution_from_a_uniform_one():
     tear = np.array([0.0, 0.01, 0.1])
-    expected = stats.expon(scale=p.TEAR).logpdf(tear) - stats.expon(scale=p.TEAR).logpdf(0.0) + p.TORN
+    expected = stats.expon(scale=p.TEAR).logpdf(tear) - stats.uniform(0, 1).logpdf(tear) - np.log(p.LOST)
     np.testing.assert_allclose(p.whole_evidence(torch.tensor(tear)), expected, atol=1e-9)
 
 

@@ -169,7 +169,7 @@ def test_two_dots_are_no_sharp_peak_and_no_dot_is_none():
 def test_an_affine_flow_is_predicted_as_it_is():
     """Where the gradient is known; where it is not, as a least-squares fit finds it: towards it with each repetition."""
     pixels = 20.0 * GRID
-    averages = FlowAverages(pixels, pixels, 1.0).double()
+    averages = FlowAverages(pixels, pixels).double()
     gradient = torch.tensor([[0.05, -0.12], [0.2, 0.03]], dtype=torch.float64)
     flow = (torch.as_tensor(pixels) @ gradient.T + torch.tensor([3.0, -2.0]))[None]
     weight = torch.ones(1, len(GRID), dtype=torch.float64)

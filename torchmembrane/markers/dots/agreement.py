@@ -1,5 +1,7 @@
 """Which blob is which dot, so that neighbours agree on where they went: belief propagation on the pattern's triangles."""
 
+from math import log
+
 import numpy as np
 import torch
 from scipy.spatial import Delaunay
@@ -7,12 +9,10 @@ from torch import Tensor, nn
 
 from ...control_flow import fori_loop, traced
 from ..spacing import spacing, square_distance
-from .scales import CANDIDATES, FAR, PREDICTION, REACH
+from .scales import CANDIDATES, FAR, LOST, PREDICTION, REACH
 
-PULL = 2.0  # pitches: standard deviation of a dot from where it is expected; wide, it only decides between equals
-DOUBT = 5.0  # what a lost dot costs, and a wrong step or size at most, as half the square of standard deviations
-EXCHANGES = 20
-DAMPING = 0.3  # of the messages
+DOUBT = -log(LOST)  # what a lost dot costs, and a wrong step or size at most
+EXCHANGES = 20  # of messages between all neighbours
 
 
 def edges(pixels: np.ndarray) -> np.ndarray:
@@ -63,7 +63,7 @@ class NeighbourAgreement(nn.Module):
         self.register_buffer("reverse", torch.as_tensor(np.roll(np.arange(2 * count), count)))
         self.register_buffer("incoming", torch.as_tensor(incoming))
         self.register_buffer("narrowness", torch.as_tensor(0.5 / (PREDICTION * np.tile(length, 2)) ** 2)[:, None, None])
-        self.register_buffer("pull", torch.as_tensor(0.5 / (PULL * pitch) ** 2)[:, None])
+        self.register_buffer("pull", torch.as_tensor((REACH * pitch) ** -2.0)[:, None])
         self.register_buffer("lost", torch.as_tensor(DOUBT * seen.astype(float))[:, None])
         self.register_buffer("reach", torch.as_tensor((REACH * pitch) ** 2)[:, None])
 
@@ -101,10 +101,11 @@ class NeighbourAgreement(nn.Module):
 
     @traced
     def exchange(self, messages: Tensor, own: Tensor, pair: Tensor) -> tuple[Tensor]:
-        """The next messages `[B, E, C + 1]`: what each choice of an edge's end costs its beginning and all behind that."""
+        """The next messages `[B, E, C + 1]`: what each choice of an edge's end costs its beginning and all behind that, damped
+        by a mean with those before."""
         behind = self.beliefs(messages, own).index_select(1, self.source) - messages.index_select(1, self.reverse)
         told = (behind[..., None] + pair).amin(-2)
-        return (DAMPING * messages + (1 - DAMPING) * (told - told.amin(-1, keepdim=True)),)
+        return ((messages + told - told.amin(-1, keepdim=True)) / 2,)
 
     def beliefs(self, messages: Tensor, own: Tensor) -> Tensor:
         """What each choice costs in all, `[B, D, C + 1]`."""

@@ -8,21 +8,18 @@ from ...control_flow import traced
 from ...solve.elimination import solve_dense
 from ..neighbourhood import weighted_median
 from ..spacing import spacing, square_distance
-from .scales import CANDIDATES, NONE, REACH
+from .probability import LEAST
+from .scales import CANDIDATES, NONE, REACH, STEPS
 
-VOTE = 0.25  # pitches, width of a vote and distance of the shifts
-HOME = 4.0  # pitches: of two shifts with alike many votes the smaller is taken
-FITS, WIDTH = 5, 0.4  # of the affine map, and pitches in which it looks for blobs
-STIFFNESS = 0.05  # of the affine map, per dot
-OTHER_SIZE = 1e3  # square pitches, by which a blob of another size is farther
+VOTE = 0.4  # pitches: width of a vote, distance of the shifts, and about where the affine map looks for blobs
 
 
 class Alignment(nn.Module):
     """Lays a pattern on the blobs of a frame as a whole.
 
     There are two starts: where the dots were, and the rest pattern under the median of the deformation measured at the blobs.
-    For each, all pairs of a dot and a blob vote for a shift. The start with the most votes is brought onto the blobs by an
-    affine map, in a few steps of expectation and maximisation (after Myronenko and Song 2010).
+    For each, all pairs of a dot and a blob vote for a shift, small ones with more weight. The start with the most votes is
+    brought onto the blobs by an affine map, in a few steps of expectation and maximisation (after Myronenko and Song 2010).
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest about their mean, px.
@@ -38,13 +35,13 @@ class Alignment(nn.Module):
 
     def __init__(self, pixels: np.ndarray, seen: np.ndarray):
         super().__init__()
-        shifts = np.arange(-REACH, REACH + VOTE / 2, VOTE)
+        shifts = np.linspace(-REACH, REACH, 1 + 2 * round(REACH / VOTE))
         self.register_buffer("pixels", torch.as_tensor(pixels))
         self.register_buffer("unit", torch.as_tensor(np.median(spacing(pixels)[0])))
         self.register_buffer("shifts", torch.as_tensor(shifts))
-        self.register_buffer("home", torch.as_tensor(np.exp(-(shifts[:, None] ** 2 + shifts**2) / (2 * HOME**2))))
+        self.register_buffer("home", torch.as_tensor(np.exp(-(shifts[:, None] ** 2 + shifts**2) / (2 * REACH) ** 2)))
         self.register_buffer("seen", torch.as_tensor(seen.astype(float))[:, None])
-        self.register_buffer("ridge", torch.diag(torch.tensor([STIFFNESS, STIFFNESS, 1e-3], dtype=torch.float64)))
+        self.register_buffer("ridge", 1e-3 * torch.eye(3, dtype=torch.float64))
 
     @traced
     def forward(self, before: Tensor, blobs: Tensor, misfit: Tensor, deformation: Tensor, valid: Tensor) -> Tensor:
@@ -65,14 +62,15 @@ class Alignment(nn.Module):
         before, votes = self.shifted(before, blobs, weight)
         mapped, others = self.shifted(self.pixels @ typical.mT, blobs, weight)
         place = torch.where((others > votes)[:, None, None], mapped, before)
-        for _ in range(FITS):
-            place = self.mapped(place, blobs, weight, WIDTH * self.unit)
+        for _ in range(STEPS):
+            place = self.mapped(place, blobs, weight, VOTE * self.unit)
         return place
 
     def shifted(self, place: Tensor, blobs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """`place [B, D, 2]` after the shift with the most votes, and these `[B]`."""
         square = square_distance(place, blobs)
-        index = (square + OTHER_SIZE * self.unit**2 * (1 - weight)).topk(min(CANDIDATES, blobs.shape[1]), largest=False).indices
+        near = square / (2 * (REACH * self.unit) ** 2) - weight.clamp_min(LEAST).log()
+        index = near.topk(min(CANDIDATES, blobs.shape[1]), largest=False).indices
         there = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         offset = ((there - place[:, :, None]) / self.unit).flatten(1, 2)
         along_u, along_v = torch.exp(-((offset[..., None] - self.shifts) / VOTE).square() / 2).unbind(2)

@@ -6,13 +6,11 @@ from torch import Tensor, nn
 
 from ...control_flow import fori_loop, traced
 from ..spacing import FADED, neighbours, spacing, square_distance
-from .scales import FAR, NONE
+from .scales import CANDIDATES, FAR, NEIGHBOURS, NONE, RIDGE
 
-WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
-NEIGHBOURS = 8  # that are mapped
-TARGETS = 12  # blobs on which they are laid
+WIDTH = 0.2  # pitches, within which a neighbour's blob lies from where a deformation puts it
 AVERAGE = 0.8  # pitches, over which a deformation is averaged
-RIDGE = 0.2  # draws a fit to the one before
+FITS = 6  # of a deformation to the blobs around
 
 
 def monomial_map() -> Tensor:
@@ -61,7 +59,7 @@ class LocalDeformation(nn.Module):
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
         first, *scene = self.begin(blobs, valid)
         gradient: Tensor
-        (gradient,) = fori_loop(self.refine, [(width,) for width in WIDTHS], (first,), *scene, valid)
+        (gradient,) = fori_loop(self.refine, FITS, (first,), *scene, valid)
         return gradient
 
     @traced
@@ -70,33 +68,33 @@ class LocalDeformation(nn.Module):
 
         Returns:
             A first gradient `[B, 2, 2, K]`; monomials `[B, K, 6, M]` of the dots around; of the blobs beside, in pitches,
-            what their square distance needs `[B, K, 4, 12]`, and positions and validity `[B, K, 3, 12]`; how near all
+            what their square distance needs `[B, K, 4, C]`, and positions and validity `[B, K, 3, C]`; how near all
             blobs (columns) have the others `[B, K, K]`.
         """
         middle = self.pixels.mean(0)
         own = square_distance(blobs - middle, self.pixels - middle).argmin(-1)
         around, pitch = self.around[own], self.pitch[own]
         apart = square_distance(blobs - middle, blobs - middle)
-        index = (apart + FAR * (1 - valid[:, None])).topk(min(1 + TARGETS, blobs.shape[1]), largest=False).indices[..., 1:]
+        index = (apart + FAR * (1 - valid[:, None])).topk(min(1 + CANDIDATES, blobs.shape[1]), largest=False).indices[..., 1:]
         known = torch.cat([blobs.mT, valid[:, None]], 1).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1))
         position, there = known.unflatten(2, index.shape[1:]).split([2, 1], 1)
-        others = (position - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, 12]
+        others = (position - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, C]
         square = others.square().sum(1, keepdim=True)
         away = torch.cat([-2 * others, torch.ones_like(square), square], 1)
         beside = torch.cat([others * there, there], 1)
         nearby = torch.exp((apart / (-2 * (AVERAGE * pitch[:, None]) ** 2)).clamp_min(-FADED)) * valid[..., None]
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
-        ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
+        ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.5, 2.0)
         return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
 
     @traced
     def refine(
-        self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor, width: float
+        self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor
     ) -> tuple[Tensor]:
-        """The gradient after another fit, with blobs believed up to about `width` pitches off; the rest as of `begin`."""
+        """The gradient after another fit, with blobs believed up to about `WIDTH` pitches off; the rest as of `begin`."""
         a, b, c, d = gradient.flatten(1, 2).unbind(1)
         entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
-        mapped = (entries * (-0.5 / width**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
+        mapped = (entries * (-0.5 / WIDTH**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
         target = beside @ torch.exp((away.mT @ mapped).clamp_min(-FADED))
         target = target / (target[:, :, 2:] + NONE)  # weight times position, weight: [B, K, 3, M]
         sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))

@@ -8,12 +8,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .bands import BandProduct, SeparableMap, blur_rows, linear_rows, pair_means
-from .probability import SHADE
 from .pyramid import LEVELS
+from .scales import PREDICTION, SHADE
 
 FINEST_SIGMA = 0.9  # of the blob detector on a level of the pyramid, pixels of the level
 SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
-LARGEST_CELL = 0.3  # pitches: two dots are two cells apart at least, or one hides the other
 
 Span = tuple[int, int]
 
@@ -58,7 +57,7 @@ class BlobDetector(nn.Module):
     """The strongest dark blobs: maxima over place and scale of the normalised Hessian's determinant.
 
     Only the box that holds the membrane is looked at. Maxima are looked for on cells of 2 x 2 pixels of the finest level
-    in use, smaller ones where the dots stand close, and interpolated by a parabola.
+    in use, of up to `PREDICTION` times the pitch, and interpolated by a parabola.
 
     Args:
         radii: of the pattern's dots `[D]`, px; their 5th to 95th percentile spans the scales.
@@ -67,7 +66,7 @@ class BlobDetector(nn.Module):
         inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
 
     Limitations:
-        Two blobs nearer than a quarter of `pitch` are one. Where there are fewer than `count`, others of strength about
+        Two blobs nearer than `PREDICTION` times `pitch` are one. Where there are fewer than `count`, others of strength about
         0 fill up the list.
     """
 
@@ -83,8 +82,8 @@ class BlobDetector(nn.Module):
         radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
         levels = np.log2(np.maximum(radii / (FINEST_SIGMA * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
         height, width = inside.shape[-2:]
-        self.cell = min(2 ** (int(levels[0]) + 1), 2 ** max(0, int(np.log2(LARGEST_CELL * pitch))))
-        self.reach, self.count = max(1, int(0.25 * pitch / self.cell)), count
+        self.cell = min(2 ** (int(levels[0]) + 1), 2 ** max(0, int(np.log2(PREDICTION * pitch))))
+        self.reach, self.count = max(1, int(PREDICTION * pitch / self.cell)), count
         block = max(self.cell, 2 ** (LEVELS - 1))
         lit = inside[0, 0].numpy() > 0
         self.box = _span(np.any(lit, 1), block), _span(np.any(lit, 0), block)

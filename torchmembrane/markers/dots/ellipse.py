@@ -5,6 +5,8 @@ import torch
 from torch import Tensor
 
 SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
+TOLERANCE = 0.45
+"""Standard deviation of a dot's log radius; of dots of two sizes, over the difference of these where that is below 1."""
 
 
 def half_axes(shapes: np.ndarray) -> np.ndarray:
@@ -44,9 +46,9 @@ def size_tolerance(shapes: np.ndarray, sizes: np.ndarray) -> float:
         0.45
     """
     if sizes.min() == sizes.max():
-        return 0.45
+        return TOLERANCE
     log_radius = log_radii(shapes)
-    return float(np.clip(0.45 * abs(np.median(log_radius[sizes == 1]) - np.median(log_radius[sizes == 0])), 0.2, 0.45))
+    return TOLERANCE * min(1.0, abs(float(np.median(log_radius[sizes == 1]) - np.median(log_radius[sizes == 0]))))
 
 
 def draw_dots(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int]) -> Tensor:

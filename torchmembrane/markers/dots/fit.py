@@ -10,8 +10,9 @@ from ...machine_code import takes
 from ...solve.elimination import solve_dense
 from ..spacing import spacing
 from .ellipse import SOFTNESS, half_axes, rms_half_axes
-from .native_fit import MISFIT, STANDS_OUT, NativeFit
+from .native_fit import MISFIT, NativeFit
 from .pyramid import LEVELS
+from .scales import FAINT
 
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
 FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
@@ -88,8 +89,8 @@ class EllipseFit(nn.Module):
         level = np.floor(np.log2(np.maximum(short / FINEST, 1))).astype(int).clip(0, LEVELS - 1)
         stride = 2**level
         sizes = np.array([(height // 2**k, width // 2**k) for k in range(LEVELS)])
-        gap = (0.85 * spacing(pixels)[0] - 2 * long) / stride
-        ring = np.clip(0.7 * gap, 1.5, RING) * stride
+        gap = (spacing(pixels)[0] - 2 * long) / stride
+        ring = np.clip(gap / 2, 1, RING) * stride
         half = int(np.round(((long + ring) / stride).max()))
         self.native = NativeFit()
         self.half_width = min(half, (min(sizes[level].min(0)) - 1) // 2)
@@ -111,8 +112,7 @@ class EllipseFit(nn.Module):
         self.register_buffer("ridge", torch.as_tensor(ridge))
         self.register_buffer("unit_loads", torch.eye(7, dtype=torch.float64)[:, 4:6])
         self.register_buffer("least", torch.tensor(1e-12, dtype=torch.float64))
-        farthest = torch.tensor([[-2.0, -2.0, -1.0], [2.0, 2.0, 1.6]])
-        self.register_buffer("farthest", farthest[..., None, None])
+        self.register_buffer("farthest", torch.tensor([2.0, 2.0, 1.0])[:, None, None])
 
     def _register_levels(self, level: np.ndarray, offset: np.ndarray, sizes: np.ndarray) -> None:
         """Which dots are fitted on which level, and where in it the pixels of a window are."""
@@ -176,7 +176,7 @@ class EllipseFit(nn.Module):
             solved = solve_dense(gram[..., :7, :7] + self.ridge, loads)
             fit = solved[..., 0].movedim(-1, 0)  # [7, B, D]
             gain = fit[3] / (fit[3] * fit[3] + 1e-6)  # one over the amplitude, finite where that vanishes
-            change = (change + torch.tanh(fit[4:] * gain / reach)).clamp(*self.farthest)
+            change = (change + torch.tanh(fit[4:] * gain / reach)).clamp(-self.farthest, self.farthest)
             moved, before = change * reach, (fit, gain)
         missed = _missed(gram, solved[..., :1])
         explained, contrast = self._seen(gram, fit, missed, offset / self.sharpness, mean[..., 0])
@@ -209,14 +209,13 @@ class EllipseFit(nn.Module):
         return Outline(depth, template, template.addcmul(template, template, value=-1), normal, length)
 
     def _intrusion(self, fit: Tensor, gain: Tensor, template: Tensor, window: Tensor) -> Tensor:
-        """By what `[B, D, P]` the weight of a pixel is divided that is darker than the fit before and outside the outline."""
-        gain = gain / -STANDS_OUT
+        """By what `[B, D, P]` the weight of a pixel is divided that is darker than the fit before and outside the outline: by 2
+        where it is darker by `FAINT` times the dot's amplitude."""
+        gain = gain / -FAINT
         scaled = (fit[:4] * gain).movedim(0, -1)
         darker = (scaled[..., :3] @ self.linear).addcmul(scaled[..., 3:], template)
-        darker = darker.addcmul(gain[..., None], window, value=-1).clamp(0, 10)
-        square = darker * darker
-        fourth = square * square
-        return 1 + fourth.addcmul(fourth, template, value=-1)
+        square = darker.addcmul(gain[..., None], window, value=-1).clamp_min(0).square()
+        return 1 + square.square() * (1 - template)
 
     def _gram(self, outline: Outline, window: Tensor, weight: Tensor) -> Tensor:
         """Weighted products `[B, D, 8, 8]` of 1, u, v, the template, its derivatives, and last the window itself."""

@@ -6,21 +6,20 @@ from torch import Tensor, nn
 
 from ..spacing import faded, spacing
 from .native_flow import flows, found_by, gradients, is_native
+from .scales import RIDGE
 
-RIDGE = 0.5  # draws the flow's gradient to the one measured, where neighbours do not fix it
-SUPPORT = 0.8  # sure nodes, weighted by distance, that a prediction needs
+SUPPORT = 0.5  # sure nodes, weighted by distance, that a prediction needs
 
 
 class FlowAverages(nn.Module):
     """Moving averages of the flow around every dot, over its neighbours, itself left out.
 
-    Weights `w_n exp(-|x_n - x_d|^2 / 2 h_d^2)`, `h_d` the local pitch times `width`. The last nodes, the anchors, have no
+    Weights `w_n exp(-|x_n - x_d|^2 / 2 h_d^2)`, `h_d` the local pitch. The last nodes, the anchors, have no
     flow and weight 1. Dots are the last axis throughout: weight `[B, D]`, flow `[B, 2, D]`, gradient `[B, 2, 2, D]`.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
         nodes: `[N, 2]`, the dots and after them the anchors, px.
-        width: of the average, pitches.
     """
 
     moments: Tensor
@@ -30,9 +29,9 @@ class FlowAverages(nn.Module):
     pull: Tensor
     h: Tensor
 
-    def __init__(self, pixels: np.ndarray, nodes: np.ndarray, width: float):
+    def __init__(self, pixels: np.ndarray, nodes: np.ndarray):
         super().__init__()
-        count, h = len(pixels), width * spacing(pixels)[1]
+        count, h = len(pixels), spacing(pixels)[1]
         y = (nodes[:, None] - pixels) / h[None, :, None]  # [N, D, 2]
         self.kernel = faded(-0.5 * (y**2).sum(-1))
         self.kernel[np.arange(count), np.arange(count)] = 0
@@ -48,15 +47,6 @@ class FlowAverages(nn.Module):
         self.register_buffer("raised", still + ridge[:, None])
         self.register_buffer("pull", torch.as_tensor(RIDGE * h))
         self.register_buffer("h", torch.as_tensor(h))
-
-    def rings(self, weight: np.ndarray) -> int:
-        """How many steps it takes the growth from the nodes `weight [S, N]` to reach every dot it can reach."""
-        count, reached, steps = self.kernel.shape[1], weight, 0
-        while True:
-            grown = np.maximum(reached[:, :count], reached @ self.kernel * 0.7 > SUPPORT)
-            if (grown == reached[:, :count]).all():
-                return steps
-            reached, steps = np.column_stack([grown, reached[:, count:]]), steps + 1
 
     def gradient(self, weight: Tensor, flow: Tensor, prior: Tensor) -> Tensor:
         """Gradient `[B, 2, 2, D]` of the least-squares affine flow, drawn to `prior` where neighbours do not fix it."""

@@ -20,17 +20,15 @@ from .native_flow import KEPT_STEPS
 from .pattern import DotPattern
 from .probability import LEAST, alone, among_neighbours, contrast_evidence, whole_evidence
 from .pyramid import mean_pyramid
-from .scales import REACH
+from .scales import FAINT, REACH, STEPS
 from .seams import Seams
 
-STEPS = 3  # of the fit
 DIGITS = 8.0  # float32 has 20 binary ones after the point beside it
 BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
 """Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
 what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
-FAINT_BLOB = 0.4  # strength of a blob, over that of the frame's clearer ones, that is as likely a dot as none
-LARGEST_STRAIN = 0.6  # of the outlines from which the fit starts
-SPARE = 1.2, 16  # blobs that are wanted for each dot, and more
+LARGEST_STRAIN = 0.5  # of the outlines from which the fit starts
+SPARE = 1.3  # blobs that are wanted for each dot
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
@@ -48,7 +46,7 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     corners = points[triangulation.simplices]
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
     pitch = np.append(spacing(pixels)[1], np.zeros(len(anchors)))[triangulation.simplices].max(1)
-    kept = np.append(longest < 3 * pitch, False)
+    kept = np.append(longest < REACH * pitch, False)
     place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
     triangle = triangulation.find_simplex(place)
     of_dot = np.append((triangulation.simplices < len(pixels)).any(1), False)
@@ -154,7 +152,7 @@ class DotLocator(nn.Module):
         self.fit = EllipseFit(pixels, shapes, image_size, tolerance)
         inside = membrane_mask(pixels, anchors, image_size)
         radii = np.sqrt(np.abs(np.linalg.det(shapes)))
-        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(SPARE[0] * len(pixels)) + SPARE[1], inside)
+        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(SPARE * len(pixels)), inside)
         drawn = mean_pyramid(draw_dots(pixels, shapes, image_size))
         blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
         blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
@@ -197,7 +195,7 @@ class DotLocator(nn.Module):
         blobs, log_radius, strength = self.detect(levels)
         relative = strength / self.strength[self.match.nearest_dots(blobs)]
         level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True).clamp_min(LEAST)
-        valid = torch.sigmoid(contrast_evidence(relative / level, FAINT_BLOB))
+        valid = torch.sigmoid(contrast_evidence(relative / level, FAINT))
         level_0, level_1, level_2 = levels
         start = self._alike(blobs, BLOB), self._alike(log_radius, SHARE), self._alike(valid, SHARE)
         return level_0, level_1, level_2, *start

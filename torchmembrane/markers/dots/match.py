@@ -14,15 +14,11 @@ from .alignment import Alignment
 from .deformation import LocalDeformation
 from .flow import SUPPORT, FlowAverages
 from .native_flow import choices, found_by, is_native
-from .probability import LOST, own_evidence
-from .scales import FAR, PREDICTION
+from .probability import LEAST, own_evidence
+from .scales import FAR, LOST, PREDICTION, STEPS
 from .steps import NeighbourSteps
 
-ROUNDS = 2  # in which neighbours agree, and in which dots that strayed are let go
-SETTLING = 3  # steps after each
-KEPT = 0.3  # certainty of a dot that could be followed
-WIDTH = 1.1  # of the local average, pitches
-NO_DOT = 3.0  # by which the log radius of what is no dot is off
+FOUND = 0.3  # certainty above which a dot counts as found
 
 State = tuple[Tensor, Tensor, Tensor]
 """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
@@ -65,7 +61,7 @@ class DotMatcher(nn.Module):
         self.alignment = Alignment(pixels - pixels.mean(0), seen)
         self.agreement = NeighbourAgreement(pixels, seen)
         self.deformation = LocalDeformation(pixels)
-        self.averages = FlowAverages(pixels, pixels, WIDTH)
+        self.averages = FlowAverages(pixels, pixels)
         self.neighbour_steps = NeighbourSteps(pixels, seen)
         self.register_buffer("seen", torch.as_tensor(seen))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
@@ -148,7 +144,7 @@ class DotMatcher(nn.Module):
         def doubted() -> Sequence[Tensor]:
             known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
             begun = self.from_sure(weight, flow, strain, known, base)
-            return self.either(complete, weight, flow, strain, *fori_loop(self.doubt, ROUNDS, begun, known, base))
+            return self.either(complete, weight, flow, strain, *fori_loop(self.doubt, STEPS, begun, known, base))
 
         return self.end(*cond(complete, (weight, flow, strain), doubted))
 
@@ -158,9 +154,9 @@ class DotMatcher(nn.Module):
         known, base = self.scene(deformation, blobs, log_radius, valid)
         place, blobs, misfit = self.begin(blobs, log_radius, valid, previous)
         place = self.alignment(place, blobs, misfit, deformation, valid)
-        for _ in range(ROUNDS):
+        for _ in range(STEPS):
             place, support = self.expected(place, *self.agreement(place, blobs, misfit))
-        weight, flow, strain = fori_loop(self.settle, SETTLING, self.chosen(place, support, known, base), known, base)
+        weight, flow, strain = fori_loop(self.settle, STEPS, self.chosen(place, support, known, base), known, base)
         return weight, flow, strain
 
     @traced
@@ -208,7 +204,7 @@ class DotMatcher(nn.Module):
         weight, flow = found.to(base.dtype), flow.mT
         state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
         weight, flow, strain = self.settle(*state, known, base)
-        return weight, flow, strain, ~(found & ~(weight >= KEPT)).any(-1)
+        return weight, flow, strain, ~(found & ~(weight >= FOUND)).any(-1)
 
     @traced
     def sure(
@@ -216,14 +212,14 @@ class DotMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the dots that are found say, the same to the last digit whether they were followed or searched for; and in which
         frames `[B]` all are found, so that none can be on another's blob."""
-        complete = ((weight >= KEPT) | ~self.seen).all(-1)
+        complete = ((weight >= FOUND) | ~self.seen).all(-1)
         weight, flow, strain = self.from_sure(weight, flow, strain, known, base)
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
 
     @traced
     def from_sure(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """A step from the dots that are found alone: which they are and where, not how surely."""
-        found = (weight >= KEPT).to(flow.dtype)
+        found = (weight >= FOUND).to(flow.dtype)
         return self.settle(found, found[:, None] * flow, torch.zeros_like(strain), known, base)
 
     @traced
@@ -253,7 +249,8 @@ class DotMatcher(nn.Module):
 
     def misfit(self, log_radius: Tensor, valid: Tensor) -> Tensor:
         """How ill the blobs' sizes fit the dots, squared standard deviations `[B, D, K]`; what is no dot fits none."""
-        return ((self.log_radius[:, None] - (log_radius + NO_DOT * (1 - valid))[:, None]) / self.size_tolerance).square()
+        no_dot = -2 * valid.clamp_min(LEAST).log()
+        return ((self.log_radius[:, None] - log_radius[:, None]) / self.size_tolerance).square() + no_dot[:, None]
 
     @traced
     def grow(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
@@ -271,7 +268,7 @@ class DotMatcher(nn.Module):
         """Some steps more after those that took another's blob have been let go."""
         own = own_evidence(*self.neighbour_steps(self.pixels.mT + flow, weight, strain))
         state = weight * torch.sigmoid(own), flow, strain
-        for _ in range(SETTLING):
+        for _ in range(STEPS):
             state = self.settle(*state, known, base)
         return state
 

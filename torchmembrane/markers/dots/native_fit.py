@@ -13,16 +13,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...machine_code import Kept, compiled, fingerprint, kept
+from .scales import FAINT
 
 MISFIT = 0.02
 """Of the residual's variance, what differs from image to image besides noise: most of it is the model's, in all."""
 
-STANDS_OUT = 0.35
-"""Of a dot's amplitude: what is darker than the fit before by so much counts half outside the dot."""
-
 LANES, FIELDS, UNKNOWNS = 16, 8, 7
 """Pixels of a block; fields of a pixel, the last the window itself; unknowns of a fit."""
-HALF, ONE, TINY, DARKEST = np.float32(0.5), np.float32(1), np.float32(1e-12), np.float32(10)
+HALF, ONE, TINY = np.float32(0.5), np.float32(1), np.float32(1e-12)
 LARGEST = np.float32(7.90531110763549805)
 """Beyond it tanh is 1."""
 TOP = (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08, 1.48572235717979e-05)
@@ -49,9 +47,9 @@ class Constants(NamedTuple):
     counts: Any
     """`[P']`, 1 for each pixel, then zeros."""
     farthest: Any
-    """`[2, 3]`, changes over their reach."""
+    """`[3]`, changes over their reach."""
     numbers: Any
-    """`[3]`: half the window's width, `MISFIT`, one over the variance of log radii."""
+    """`[4]`: half the window's width, `MISFIT`, one over the variance of log radii, `FAINT`."""
 
 
 @compiled
@@ -123,7 +121,7 @@ def _outlined(c, d, rows, offset, growth, before, window, fields):
             radius, per_length = np.sqrt(x * x + y * y + TINY), ONE / np.sqrt(along * along + down * down + TINY)
             depth = growth + (radius - radius * radius) * per_length
             template = _sigmoid(depth)
-            darker = min(max(b0 + bu * s + bv * t + bt * template - bw * own, np.float32(0)), DARKEST)
+            darker = max(b0 + bu * s + bv * t + bt * template - bw * own, np.float32(0))
             square = darker * darker
             weight = _sigmoid(depth * fall + ring) / (ONE + square * square * (ONE - template)) * c.counts[first + k]
             root = np.sqrt(weight)
@@ -224,9 +222,9 @@ def _entry(sources: str) -> Any:
                     gain = system[3, 7] / (system[3, 7] ** 2 + np.float32(1e-6))
                     for a in range(3):
                         after = change[a] + np.tanh(system[4 + a, 7] * gain / reach[a])
-                        change[a] = min(max(after, c.farthest[0, a]), c.farthest[1, a])
+                        change[a] = min(max(after, -c.farthest[a]), c.farthest[a])
                         moved[a] = change[a] * reach[a]
-                    before[4] = gain / np.float32(-STANDS_OUT)
+                    before[4] = -gain / c.numbers[3]
                     for a in range(4):
                         before[a] = system[a, 7] * before[4]
                 _told(c, d, gram, system, offset, moved, size, gain, mean, noise[b], dots[b, d], covariance[b, d])
@@ -283,6 +281,6 @@ def _constants(fit: Any) -> Constants:
         steps=offsets.long().contiguous().numpy(),
         offsets=F.pad(offsets, (0, wide)).numpy(),
         counts=F.pad(ones, (0, wide))[0].numpy(),
-        farthest=fit.farthest[:, :, 0, 0].contiguous().numpy(),
-        numbers=np.array([fit.half_width, MISFIT, fit.narrowness], np.float32),
+        farthest=fit.farthest[:, 0, 0].contiguous().numpy(),
+        numbers=np.array([fit.half_width, MISFIT, fit.narrowness, FAINT], np.float32),
     )

@@ -9,11 +9,12 @@ from scipy.spatial import cKDTree
 from ...files.levels import telling_bits
 from ..spacing import neighbours, partly_in_view
 from .blobs import check_count, find_blobs
-from .ellipse import log_radii, rms_half_axes, size_tolerance
+from .ellipse import TOLERANCE, log_radii, rms_half_axes, size_tolerance
 from .fit import EllipseFit, FittedDots
 from .match import DotMatcher
 from .probability import alone, among_neighbours
 from .pyramid import mean_pyramid
+from .scales import FAINT, NEIGHBOURS, STEPS
 
 
 class DotPattern(NamedTuple):
@@ -30,7 +31,7 @@ class DotPattern(NamedTuple):
     sizes: np.ndarray
 
 
-def refine(dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: float = 0.45) -> FittedDots:
+def refine(dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: float = TOLERANCE) -> FittedDots:
     """Dots fitted to sub-pixel accuracy, a batch of one."""
     fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance)
     levels = mean_pyramid(torch.as_tensor(dark)[None, None])
@@ -42,10 +43,10 @@ def population(pixels: np.ndarray, shapes: np.ndarray, contrasts: np.ndarray) ->
     """Which blobs `[N]` belong to the pattern: their size and contrast is near that of the blobs around them."""
     log_radius = log_radii(shapes)
     keep = np.ones(len(pixels), bool)
-    for _ in range(3):
-        near = cKDTree(pixels[keep]).query(pixels, k=min(9, keep.sum()))[1]
+    for _ in range(STEPS):
+        near = cKDTree(pixels[keep]).query(pixels, k=min(1 + NEIGHBOURS, keep.sum()))[1]
         radius, contrast = np.median(log_radius[keep][near], 1), np.median(contrasts[keep][near], 1)
-        keep = (np.abs(log_radius - radius) < np.log(2.2)) & (contrasts > 0.35 * contrast)
+        keep = (np.abs(log_radius - radius) < np.log(2.2)) & (contrasts > FAINT * contrast)
     return keep
 
 
@@ -54,7 +55,7 @@ def size_classes(pixels: np.ndarray, shapes: np.ndarray) -> np.ndarray:
     log_radius = log_radii(shapes)
     x = (pixels - pixels.mean(0)) / pixels.std()
     field = np.stack([np.ones(len(x)), *x.T, x[:, 0] ** 2, x[:, 1] ** 2, x[:, 0] * x[:, 1]], -1)
-    local = np.column_stack([log_radius, log_radius[neighbours(pixels, 8)]])
+    local = np.column_stack([log_radius, log_radius[neighbours(pixels, NEIGHBOURS)]])
     large = log_radius > (local.max(1) + local.min(1)) / 2
     for _ in range(20):
         basis = np.column_stack([field, large])

@@ -10,28 +10,20 @@ import torch
 from torch import Tensor
 
 from .fit import FittedDots
+from .scales import LOST, PREDICTION, SHADE
 
 PIXELS = 10.0
 """Pixels of a window that each say something of their own: what a fit leaves over comes in clumps, unlike noise."""
 PARAMETERS = 4.0
 """Of a dot, beyond its background: contrast, place and size."""
-FAINT = 0.5
-"""Contrast, over that of the frame's clearer dots, of what is as likely a dot as none."""
 CONTRAST_DEVIATION = 0.22
 """Standard deviation of the contrasts of dots, and of what is none, over that of the clearer dots."""
-SHADE = 0.05
-"""Contrast of dirt and shade in any frame."""
 STEP_DEVIATION = 0.12
 """Standard deviation of the steps between neighbours that are found, over their lengths."""
-WRONG_STEP = 0.3
-"""Error of a step to a dot that is another's, over its length."""
-LOST = 0.02
-"""Share of dots lost where none is known to be."""
-TEAR = 0.0056
+TEAR = 0.004
 """Of a whole pattern, the mean of what `Seams` measures."""
-TORN = 8.0
-"""Log odds of a whole pattern against a torn one."""
 LEAST = 1e-6
+"""Keeps logarithms finite."""
 
 
 def dot_evidence(explained: Tensor) -> Tensor:
@@ -46,43 +38,44 @@ def dot_evidence(explained: Tensor) -> Tensor:
     return -0.5 * PIXELS * (1 - explained).clamp_min(LEAST).log() - 0.5 * PARAMETERS * math.log(PIXELS)
 
 
-def contrast_evidence(contrast: Tensor, faint: float) -> Tensor:
+def contrast_evidence(contrast: Tensor, middle: float = 0.5) -> Tensor:
     """Log odds of a dot against something fainter, from its contrast over that of the frame's clearer dots.
 
-    Both are normal, with `CONTRAST_DEVIATION` and 1 apart; `faint` is the middle between them.
+    Both are normal, with `CONTRAST_DEVIATION` and 1 apart, about `middle`: of what is none about 0, of dots about 1.
 
     Example:
-        >>> contrast_evidence(torch.tensor([1.0, 0.5, 0.0]), 0.5).round().tolist()
+        >>> contrast_evidence(torch.tensor([1.0, 0.5, 0.0])).round().tolist()
         [10.0, 0.0, -10.0]
     """
-    return (contrast - faint) / CONTRAST_DEVIATION**2
+    return (contrast - middle) / CONTRAST_DEVIATION**2
 
 
 def own_evidence(found: Tensor, error: Tensor) -> Tensor:
     """Log odds of a dot being itself against being another's.
 
     The share of the dots around that is `found [B, D]`, in 0..1, is the share of right ones to begin with. The relative error
-    of the steps to them, `error [B, D]`, is normal with `STEP_DEVIATION` of a right one, and up to `WRONG_STEP` of another.
+    of the steps to them, `error [B, D]`, is normal with `STEP_DEVIATION` of a right one, and up to `PREDICTION` of another.
 
     Example:
         >>> [round(x, 1) for x in own_evidence(torch.tensor([1.0, 1.0, 0.5]), torch.tensor([0.0, 0.3, 0.3])).tolist()]
         [5.1, 1.9, -2.0]
     """
     odds = (found + LOST) / (1 - found + LOST)
-    density = 0.5 * (WRONG_STEP / STEP_DEVIATION) ** 2
+    density = 0.5 * (PREDICTION / STEP_DEVIATION) ** 2
     return odds.log() + math.log(density) - 0.5 * (error / STEP_DEVIATION).square()
 
 
 def whole_evidence(tear: Tensor) -> Tensor:
     """Log odds of a pattern that is whole around a dot against one that is torn, by what `Seams` measures `[B, D]`.
 
-    Of a whole one this is distributed exponentially with mean `TEAR`; of a torn one it may be anything.
+    Of a whole one this is distributed exponentially with mean `TEAR`; of a torn one it may be anything in 0..1. The odds of a
+    torn one to begin with are `LOST`.
 
     Example:
-        >>> [round(x, 1) for x in whole_evidence(torch.tensor([0.0, 0.045, 0.09])).tolist()]
-        [8.0, -0.0, -8.1]
+        >>> [round(x, 1) for x in whole_evidence(torch.tensor([0.0, 0.038, 0.08])).tolist()]
+        [9.4, -0.1, -10.6]
     """
-    return TORN - tear / TEAR
+    return -math.log(LOST * TEAR) - tear / TEAR
 
 
 def probability(*evidence: Tensor) -> Tensor:
@@ -117,4 +110,4 @@ def _there(dots: FittedDots) -> tuple[Tensor, Tensor]:
     """Evidence of a dot against nothing and against something fainter."""
     clearer = dots.contrast.topk(dots.contrast.shape[1] // 2, -1).values
     level = clearer.mean(-1, keepdim=True).clamp_min(0) + SHADE
-    return dot_evidence(dots.explained), contrast_evidence(dots.contrast / level, FAINT)
+    return dot_evidence(dots.explained), contrast_evidence(dots.contrast / level)

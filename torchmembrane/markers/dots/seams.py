@@ -5,9 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from ..spacing import FADED, faded, spacing, square_distance
-from .scales import PREDICTION
+from .scales import PREDICTION, REACH
 
-SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
 LEAST = 1e-3
 
 
@@ -35,10 +34,10 @@ class Seams(nn.Module):
         super().__init__()
         self.size_narrowness = -0.5 / size_tolerance**2
         nearest, mean = spacing(pixels)
-        kernel = faded(-((pixels[:, None] - pixels) ** 2).sum(-1) / (2 * (SEAM * mean) ** 2))  # [from, to]
+        kernel = faded(-((pixels[:, None] - pixels) ** 2).sum(-1) / (2 * (REACH * mean) ** 2))  # [from, to]
         self.register_buffer("share", torch.as_tensor(kernel / kernel.sum(0)))
         self.register_buffer("total", torch.as_tensor(kernel.sum(0)))
-        self.register_buffer("narrowness", torch.as_tensor(-0.5 / (SEAM * mean) ** 2))
+        self.register_buffer("narrowness", torch.as_tensor(-0.5 / (REACH * mean) ** 2))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("claim", torch.as_tensor((PREDICTION * nearest) ** 2))
         self.register_buffer("log_radius", torch.as_tensor(log_radius))

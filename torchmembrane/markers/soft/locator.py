@@ -15,7 +15,7 @@ from ..locator import LocatedMarkers, isotropic
 from ..neighbourhood import NeighbourFlow, Neighbourhood
 from ..spacing import spacing, thin_out
 from .response import pyramid
-from .search import AVERAGING_WIDTH, DotGrowth, DotSearch, Found, predict
+from .search import DotGrowth, DotSearch, Found, predict
 
 LOCATION_NOISE = 0.05  # px, of a dot in an image
 FINE_PREDICTION_ERROR = 1.0  # radii, standard deviation of where a dot is expected on the fine level
@@ -98,7 +98,7 @@ class SoftLocator(nn.Module):
         self.by_large = DotSearch(radii[small], others[small], 1, 0.2 * nearest[small], inside) if len(small) else None
         self.refine = DotSearch(radii, others, -1, FINE_PREDICTION_ERROR * radii, inside)
         nodes = np.concatenate([pixels, thin_out(anchors, 0.7 * float(np.median(mean)))])
-        self.averages = FlowAverages(pixels, nodes, AVERAGING_WIDTH)
+        self.averages = FlowAverages(pixels, nodes)
         self.neighbourhood = Neighbourhood(pixels, nodes[len(pixels) :])
         lead = self.averages.kernel[np.append(largest, np.ones(len(nodes) - len(pixels), bool))]
         lead, of_rim = np.split(lead / lead.sum(0), [len(large)])

@@ -18,8 +18,8 @@ COARSE_TEMPERATURE, FINE_TEMPERATURE = 0.25, 0.3
 WINDOW = 2.0  # half side of a window, standard deviations of the prediction
 RESPONSE_FLOOR = 0.01  # of a drawn dot's response: what is weaker is no peak
 LARGEST_RELATIVE_SPREAD = 2.5  # times its spread at rest, of a peak that is half believed
-AVERAGING_WIDTH = 1.0  # of the averages that predict, pitches
 LEAST_SUPPORT = 0.8  # sure nodes, weighted by distance, of a prediction that is half believed
+GROWN_CERTAINTY = 0.7  # of the dots that the growth has reached, where its steps are counted
 STEPS_PER_RING = 2  # steps in which the growth gains a ring: the second settles the flow from which the next is predicted
 SETTLING_STEPS = 3  # steps after the growth has reached every dot
 LEAST_GROWTH_RESPONSE = 0.05  # of a drawn dot's response, of a peak that is half believed in the growth
@@ -101,9 +101,9 @@ class DotGrowth(nn.Module):
         nearest, mean = spacing(pixels)
         anchors = thin_out(anchors, 0.7 * float(np.median(mean)))
         self.search = DotSearch(radii, others, 1, 0.3 * nearest, inside)
-        self.averages = FlowAverages(pixels, np.concatenate([pixels, anchors]), AVERAGING_WIDTH)
+        self.averages = FlowAverages(pixels, np.concatenate([pixels, anchors]))
         known = np.full(len(pixels), 0.0 if len(anchors) else 1.0)
-        self.steps = STEPS_PER_RING * self.averages.rings(np.append(known, np.ones(len(anchors)))[None]) + SETTLING_STEPS
+        self.steps = STEPS_PER_RING * rings(self.averages.kernel, np.append(known, np.ones(len(anchors)))) + SETTLING_STEPS
         self.register_buffer("pixels", torch.as_tensor(pixels))
         self.register_buffer("known", torch.as_tensor(known))
 
@@ -145,6 +145,25 @@ class DotGrowth(nn.Module):
     def moved(self, flow: Tensor) -> Tensor:
         """Return the pixels `[B, D, 2]` of the dots displaced by a flow."""
         return self.pixels + flow
+
+
+def rings(kernel: np.ndarray, weight: np.ndarray) -> int:
+    """Return the number of steps in which the growth reaches all reachable dots from the nodes of `weight [N]` 1.
+
+    Args:
+        kernel: weights `[N, D]` of the averages over the nodes, the first of which are the dots.
+        weight: weights of the nodes, 0 or 1, `[N]`.
+
+    Example:
+        >>> rings(np.eye(5, k=1) * 2, np.array([1.0, 0.0, 0.0, 0.0, 0.0]))
+        4
+    """
+    count, reached, steps = kernel.shape[1], weight, 0
+    while True:
+        grown = np.maximum(reached[:count], GROWN_CERTAINTY * reached @ kernel > LEAST_SUPPORT)
+        if (grown == reached[:count]).all():
+            return steps
+        reached, steps = np.append(grown, reached[count:]), steps + 1
 
 
 def predict(averages: FlowAverages, weight: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
