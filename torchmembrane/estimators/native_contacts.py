@@ -1,6 +1,6 @@
-"""Contact patches by machine code: what `ContactPatches.pushes` and `regions.persistent_peaks` do, without gradients.
+"""Contact patches as machine code: `ContactPatches.pushes` and `regions.persistent_peaks`, without gradients.
 
-The formulas are those of `contacts` and `regions`, which say what they mean; a test holds both to the same numbers.
+The formulas are those of `contacts` and `regions`, where they are explained; a test compares the numbers.
 """
 
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ Limits = tuple[float, float, float, float, float]
 
 
 class Constants(NamedTuple):
-    """What is constant of a membrane."""
+    """Constants of a membrane."""
 
     rest: Any
     """`[m, n, 3]`"""
@@ -47,7 +47,7 @@ class Constants(NamedTuple):
 
 @compiled
 def _smoothed(c, push, height):
-    """The push `[V]` smoothed twice, `height [V]`, zero at the border."""
+    """Return the push `[V]` smoothed twice; `height [V]` has zeros at the border."""
     m, n = c.rest.shape[:2]
     once, twice = np.empty(len(c.places), push.dtype), np.empty(len(c.places), push.dtype)
     for k in range(len(once)):
@@ -61,7 +61,7 @@ def _smoothed(c, push, height):
 
 @compiled
 def _summits(height, m, n, up):
-    """`regions._summits`."""
+    """Apply `regions._summits`."""
     for v in range(m * n):
         best, up[v] = -np.inf, v
         for p in range(max(v // n - 1, 0), min(v // n + 2, m)):
@@ -75,7 +75,7 @@ def _summits(height, m, n, up):
 
 @compiled
 def _passes(height, m, n, basin, passes):
-    """`regions._passes`."""
+    """Apply `regions._passes`."""
     passes[:] = -np.inf
     for v in range(m * n):
         for p in range(max(v // n - 1, 0), min(v // n + 2, m)):
@@ -91,7 +91,7 @@ def _passes(height, m, n, basin, passes):
 
 @compiled
 def _peaks(c, height, peaks):
-    """`regions.persistent_peaks`: fills `peaks [P]` with vertices, the highest first; how many they are."""
+    """Apply `regions.persistent_peaks`: fill `peaks [P]` with vertices, the highest first, and return their number."""
     m, n = c.rest.shape[:2]
     up, place, count, found = np.empty(m * n, np.intp), np.empty(CANDIDATES, np.intp), 0, 0
     _summits(height, m, n, up)
@@ -120,7 +120,7 @@ def _peaks(c, height, peaks):
 
 @compiled
 def _owners(c, weight, peaks, found, owner):
-    """`contact_points`: whose every vertex is, by the number of its patch, the strongest first."""
+    """Apply `contact_points`: return the number of the patch that each vertex belongs to; patch 0 is the strongest."""
     rest, loads, order = c.rest.reshape((-1, 3)), np.zeros(found), np.zeros(found, np.intp)
     for v in range(len(rest)):
         least = np.inf
@@ -140,7 +140,7 @@ def _owners(c, weight, peaks, found, owner):
 
 @compiled
 def _areas(c, x, area):
-    """`Membrane.vertex_area`."""
+    """Return `Membrane.vertex_area`."""
     m, n = c.rest.shape[:2]
     area[:] = 0
     for i in range(m - 1):
@@ -168,7 +168,7 @@ def _length(v):
 
 @compiled
 def _axes(normal, axes):
-    """`tangent_frame` of a normal, and this."""
+    """Return `tangent_frame` of a normal, and the normal itself."""
     x, y, z = normal[0], normal[1], normal[2]
     if abs(z) < ALONG_Z:
         axes[0, 0], axes[0, 1], axes[0, 2] = y, -x, 0.0
@@ -185,7 +185,7 @@ def _axes(normal, axes):
 
 @compiled
 def _curvature(c, x, mine, strong, share, axes, curvature):
-    """`ContactPatches._curvature` of the vertices `mine`; the span."""
+    """Return `ContactPatches._curvature` of the vertices `mine`, and their extent."""
     local, mean, spread2, sums, t = np.empty((len(mine), 3)), np.zeros(3), 0.0, np.zeros((6, 7)), np.empty(7)
     for i in range(len(mine)):
         for a in range(3):
@@ -220,8 +220,8 @@ def _curvature(c, x, mine, strong, share, axes, curvature):
 
 @compiled
 def _told(c, x, normals, traction, indicator, area, mine, told):
-    """What a patch tells, `told [14]`: point, force, normal, area, slip, two curvatures, whether it is at the rim; the largest
-    displacement beside the rim there."""
+    """Return the properties of a patch, `told [14]`: point, force, normal, area, slip, two curvatures, whether it touches the
+    rim, and the largest displacement beside the rim there."""
     strong, share, sums, axes = np.zeros(len(mine)), np.zeros(len(mine)), np.zeros((4, 3)), np.empty((3, 3))
     pushes, whole, strongest, at_rim, beside = 0.0, 0.0, 0.0, 0.0, 0.0
     rest, load, normal_force = c.rest.reshape((-1, 3)), np.empty(3), 0.0
@@ -257,7 +257,7 @@ def _told(c, x, normals, traction, indicator, area, mine, told):
 def _entry(sources: str) -> Any:
     @kept
     def patches(c, x, normals, traction, reference, indicator, told):
-        """Of frames `[B, V, 3]` and `[B, V]`, `indicator [B, V]` and `told [B, P, 14]` are filled."""
+        """Fill `indicator [B, V]` and `told [B, P, 14]` for frames `[B, V, 3]` and `[B, V]`."""
         V = x.shape[1]
         push, weight, height, area = np.empty((4, V), x.dtype)
         owner, peaks, mine = np.empty(V, np.intp), np.empty(told.shape[1], np.intp), np.empty(V, np.intp)
@@ -297,7 +297,7 @@ kept_patches = Kept(patches, SOURCES, 12)
 
 
 class NativePatches:
-    """The patches of one membrane. What is constant is looked up again where it has been moved."""
+    """The patches of one membrane. Constants are looked up again after a move to another device or precision."""
 
     def __init__(self) -> None:
         self._constants: tuple[Tensor, Constants] | None = None

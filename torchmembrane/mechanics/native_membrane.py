@@ -1,7 +1,7 @@
-"""The forces of a membrane and its fluid, and their tangent stiffness, triangle by triangle, by machine code.
+"""The forces of a membrane and its fluid, and their tangent stiffness, triangle by triangle, as machine code.
 
-The formulas of `hyperelastic` and of `Membrane.volume` once more, for one surface without gradients. There each formula is a
-few tensor operations over all triangles, and a grid has so few triangles that the calls themselves dominate.
+The formulas repeat those of `hyperelastic` and of `Membrane.volume` for one surface, without gradients. The tensor version has
+a few operations over all triangles, but a grid has so few triangles that the calls themselves dominate its time.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ PAIRS = ((5, 6, 4), (6, 4, 5))
 
 
 class Surface(NamedTuple):
-    """The constants of a membrane."""
+    """Constants of a membrane."""
 
     rest: Any
     """`[m, n, 3]`"""
@@ -44,7 +44,7 @@ class Surface(NamedTuple):
 
 
 def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Tensor, dtype: np.dtype) -> Surface:
-    """The constants of a membrane and its material in a precision; `load`: the rest load `[V, 3]`."""
+    """Return the constants of a membrane and its material in a precision; `load`: the rest load `[V, 3]`."""
     m, n = membrane.grid
     l2, c1, c2 = (float(value) for value in (elasticity.prestretch**2, elasticity.c1, elasticity.c2))
     law = [c1 * l2, 0.0 if elasticity.model == "harmonic" else c1 / l2**2, c2 / l2, c2 * l2**2, membrane.outward / 6]
@@ -173,8 +173,8 @@ def _of_energy(surface, t, i, j, e, by_edge):
 
 @compiled
 def _complete(free, force, A):
-    """`A` in earlier vertices, transposed, and in the vertices themselves: minus the sum of the others. Then zero what is not
-    free."""
+    """Fill the entries of `A` for earlier vertices by transposition, and the diagonal ones as minus the sum of the others; then
+    set the entries of fixed vertices to zero."""
     m, n = free.shape
     V, blocks = m * n, len(A) * A.shape[1]
     planes, first, last = A.reshape((blocks, V)), n + 1, V - n - 1

@@ -1,4 +1,4 @@
-"""Products of a vector with a matrix of means by machine code: most of its rows begin and end with zeros."""
+"""Products of a vector with a matrix of averages, as machine code: most rows of the matrix begin and end with zeros."""
 
 import numpy as np
 
@@ -18,7 +18,8 @@ def within(rows: np.ndarray) -> np.ndarray:
 
 @compiled
 def sum_rows(total, rows, places, shares):
-    """`total = shares @ rows`, four rows at a time of those that have a share; `places [N, 2]`, as of `within`."""
+    """Compute `total = shares @ rows`, four rows at a time, for the rows with a non-zero share; `places [N, 2]` is from
+    `within`."""
     chosen, own, count = np.zeros(4, np.intp), np.zeros(4, total.dtype), 0
     total[:] = 0
     for i in range(len(rows)):

@@ -30,7 +30,7 @@ EVEN = tuple(np.float32(c) for c in (1.19825839466702e-06, 1.18534705686654e-04,
 
 
 class Constants(NamedTuple):
-    """What is constant of a pattern."""
+    """Constants of a pattern."""
 
     level: Any
     """`[D]`, of the pyramid, on which a dot is fitted."""
@@ -71,7 +71,7 @@ def _sigmoid(x):
 
 @compiled
 def _window(c, d, image, centre, window, middle):
-    """The pixels about a centre, their mean taken off, and the middle of the window, px; the mean."""
+    """Return the pixels around a centre minus their mean, the middle of the window in px, and the mean."""
     stride, corner, half, count = c.scales[d, 0], c.scales[d, 1], c.numbers[0], c.steps.shape[1]
     for a in range(2):
         at = np.round((centre[a] - corner) / stride)
@@ -154,7 +154,7 @@ def _products(fields, each, gram):
 
 @compiled
 def _fitted(c, d, gram, system):
-    """`system [7, 10]` becomes `[1 x]`, of the loads of the window and of the centre's two coordinates."""
+    """Solve `system [7, 10]` in place; it becomes `[1 x]` for the loads of the window and of the centre's two coordinates."""
     for a in range(UNKNOWNS):
         for b in range(UNKNOWNS):
             system[a, b] = gram[a, b] + c.ridge[d, a, b]
@@ -172,7 +172,7 @@ def _fitted(c, d, gram, system):
 
 @compiled
 def _told(c, d, gram, system, offset, moved, size, gain, mean, noise, dot, covariance):
-    """The covariance `[2, 2]` of a centre; into `dot [6]` what the window shows, as of `FittedDots`."""
+    """Return the covariance `[2, 2]` of a centre, and write the measurements of the window to `dot [6]`, as for `FittedDots`."""
     stride, unit, missed = c.scales[d, 0], c.scales[d, 3], np.float32(0)
     for a in range(FIELDS):
         along = -gram[a, 7]
@@ -241,7 +241,7 @@ kept_fits = Kept(fits, SOURCES, 8)
 
 
 class NativeFit:
-    """The fit of one pattern. What is constant is looked up again where it has been moved."""
+    """The fit of one pattern. Constants are looked up again after a move to another device."""
 
     def __init__(self) -> None:
         self._constants: tuple[Tensor, Constants] | None = None
@@ -252,7 +252,7 @@ class NativeFit:
     def __call__(
         self, fit: Any, levels: list[Tensor], centre: Tensor, shape: Tensor, noise: Tensor, steps: int
     ) -> tuple[Tensor, ...]:
-        """What `EllipseFit.forward` gives; arguments as there, in single precision."""
+        """Return what `EllipseFit.forward` returns; same arguments, in single precision."""
         images = [level[:, 0].contiguous().numpy() for level in levels]
         given = [value.contiguous().numpy() for value in (centre, shape, noise)]
         dots, covariance = (

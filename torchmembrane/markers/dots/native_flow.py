@@ -15,7 +15,7 @@ from ...machine_code import Kept, compiled, fingerprint, kept, takes
 
 @compiled
 def _sums(weight, fields, moments, rows, sums):
-    """`sums [R, M D] = rows @ moments` of the rows weight and weight times each of `fields [R - 1, D]`."""
+    """Compute `sums [R, M D] = rows @ moments`; the rows are the weight, and the weight times each of `fields [R - 1, D]`."""
     for r in range(len(sums)):
         sums[r] = 0
         for n in range(len(weight)):
@@ -29,7 +29,7 @@ def _sums(weight, fields, moments, rows, sums):
 
 @compiled
 def _gradient(c, weight, flow, prior, rows, sums, gradient):
-    """`FlowAverages.gradient` of a frame."""
+    """Apply `FlowAverages.gradient` to one frame."""
     moments, _, _, raised, pull, h = c
     count = len(h)
     _sums(weight, flow, moments, rows, sums)
@@ -49,7 +49,7 @@ def _gradient(c, weight, flow, prior, rows, sums, gradient):
 
 @compiled
 def _along(c, weight, flow, gradient, fields, rows, sums, found):
-    """`FlowAverages.along` of a frame: `found [3, D]`, the flow and the support."""
+    """Apply `FlowAverages.along` to one frame; `found [3, D]` has the flow and the support."""
     _, moments, still, _, _, h = c
     count = len(h)
     for d in range(count):
@@ -99,7 +99,7 @@ def _choice(c, predicted, support, blobs, base, least, found):
 
 @kept
 def gradients(c, weight, flow, prior, found):
-    """`found [B, 2, 2, D]` of every frame."""
+    """Fill `found [B, 2, 2, D]` for all frames."""
     rows, sums = np.empty(len(c[5]), np.float32), np.empty((3, c[0].shape[1]), np.float32)
     for b in range(len(found)):
         _gradient(c, weight[b], flow[b], prior[b], rows, sums, found[b])
@@ -107,7 +107,7 @@ def gradients(c, weight, flow, prior, found):
 
 @kept
 def flows(c, weight, flow, gradient, found):
-    """`found [B, 3, D]` of every frame."""
+    """Fill `found [B, 3, D]` for all frames."""
     count = len(c[5])
     rows, fields, sums = np.empty(count, np.float32), np.empty((6, count), np.float32), np.empty((7, 3 * count), np.float32)
     for b in range(len(found)):
@@ -116,7 +116,7 @@ def flows(c, weight, flow, gradient, found):
 
 @kept
 def choices(c, predicted, support, blobs, base, found):
-    """`found [B, 7, D]` of every frame."""
+    """Fill `found [B, 7, D]` for all frames."""
     least = np.empty(len(c[0]), np.float32)
     for b in range(len(found)):
         _choice(c, predicted[b], support[b], blobs[b], base[b], least, found[b])
@@ -127,12 +127,13 @@ KEPT_STEPS = {function: Kept(function, SOURCES, 3) for function in (gradients, f
 
 
 def is_native(*values: Tensor) -> bool:
-    """Whether a step of these tensors is taken by machine code."""
+    """Whether machine code takes the step of these tensors."""
     return all(value.dtype == torch.float32 for value in values) and takes(*values)
 
 
 def found_by(function: Any, constants: tuple[Tensor, ...], given: tuple[Tensor, ...], *shape: int) -> Tensor:
-    """What one of the functions finds, `[B, *shape]`, from the constants of a pattern and what is `given` of the frames."""
+    """Return the results `[B, *shape]` of one of these functions, from the constants of a pattern and the tensors `given` of
+    the frames."""
     frames = next((len(value) for value in given if len(value) != 1), 1)
     found = given[0].new_empty(frames, *shape)
     with KEPT_STEPS[function].compiling(np.dtype(np.float32)):

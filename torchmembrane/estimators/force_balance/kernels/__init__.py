@@ -1,1 +1,1 @@
-"""The steps of force balance as machine code, on a processor where no gradient is recorded."""
+"""The steps of force balance as machine code, for processors and without gradients."""

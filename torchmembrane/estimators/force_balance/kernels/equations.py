@@ -1,7 +1,8 @@
-"""The equations of a step of force balance for one frame, by machine code: weights, loads, matrix.
+"""The equations of one force-balance step for one frame, as machine code: weights, loads and matrix.
 
-The formulas of `contact_force`, `traction_loss`, `bearings` and `normal_equations`, which say what they mean, once more; a test
-holds both to the same numbers. Vertices `k = i n + j` of the whole grid, but in what is said to be of `N`, the inner ones.
+The formulas repeat those of `contact_force`, `traction_loss`, `marker_residuals` and `normal_equations`, where they are explained; a
+test compares the numbers. Vertices are numbered `k = i n + j` on the whole grid, except in arrays of length `N`, which have the
+inner vertices only.
 """
 
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ NOTHING = 1e-18
 
 
 class Constants(NamedTuple):
-    """What is constant of an estimator on one grid."""
+    """Constants of an estimator on one grid."""
 
     surface: Surface
     area: Any
@@ -55,7 +56,7 @@ class Constants(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """Settings, and other numbers of an estimator."""
+    """Settings and other scalars of an estimator."""
 
     reference: float
     size: float
@@ -86,7 +87,7 @@ class Numbers(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Arrays of a step, made once: to make them would take longer than what is done in them."""
+    """Arrays of one step. They are allocated once, because allocating them takes longer than filling them."""
 
     force: Any
     """`[m, n, 3]`; as `volume`, the volume's gradient."""
@@ -124,7 +125,7 @@ class Workspace(NamedTuple):
 
 
 def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
-    """Arrays for a grid and so many markers."""
+    """Return the arrays for a grid and a number of markers."""
     m, n = grid
     N, V, width = (m - 2) * (n - 2), m * n, 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
     unknowns, rows, ld = storage(3 * N, width)
@@ -139,8 +140,8 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
 
 @compiled
 def scaled(c, work, noise_level, tau):
-    """`TractionLoss.parts` and `scale2`: `work.fields` become the normal part and the squared shear of the tractions, over the
-    reference, `S^2` and `rho^2`; `work.normal` the normals."""
+    """Apply `TractionLoss.parts` and `scale2`: fill `work.fields` with the normal part and the squared shear of the tractions
+    relative to the reference, `S^2` and `rho^2`, and `work.normal` with the normals."""
     k, N, n = c.numbers, len(c.area), c.surface.free.shape[1]
     q_n, shear2, push2, around, shares = work.fields
     for i in range(N):
@@ -173,8 +174,8 @@ def scaled(c, work, noise_level, tau):
 
 @compiled
 def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
-    """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions; `curvature`: of a push's loss, in
-    place of its weight."""
+    """Apply `TractionLoss.weights`: return `W`, and set `before` to the weights of the normal tractions; `curvature`: use the
+    curvature of a push's loss in place of its weight."""
     k, n = c.numbers, c.surface.free.shape[1]
     scaled(c, work, noise_level, tau)
     for i in range(len(c.area)):
@@ -196,13 +197,13 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
 
 @compiled
 def weight_of_shear(k, push2, cone):
-    """`TractionLoss.shear_weight`."""
+    """Return `TractionLoss.shear_weight`."""
     return k.friction / (1 + cone * np.sqrt(push2 + k.slip**4))
 
 
 @compiled
 def load_forces(c, work):
-    """`BalanceEquations.loads` of the forces; `f W v` and `v W v`."""
+    """Add the forces to the loads as `BalanceEquations.loads` does; return `f W v` and `v W v`."""
     m, n = c.surface.free.shape
     V, loads, of_loads, fWv, vWv = m * n, work.loads, work.of_loads, 0.0, 0.0
     loads[:], of_loads[:] = 0, 0
@@ -233,7 +234,7 @@ def load_forces(c, work):
 
 @compiled
 def _add_products(total, first, count, a, of_a, b, of_b, at):
-    """`total[first + k] += sum_c a[c, of_a, at + k] b[c, of_b, at + k]`, of `count` vertices."""
+    """Add `sum_c a[c, of_a, at + k] b[c, of_b, at + k]` to `total[first + k]` for `count` vertices."""
     out = total[first : first + count]
     a0, a1, a2 = a[0, of_a, at : at + count], a[1, of_a, at : at + count], a[2, of_a, at : at + count]
     b0, b1, b2 = b[0, of_b, at : at + count], b[1, of_b, at : at + count], b[2, of_b, at : at + count]
@@ -243,7 +244,7 @@ def _add_products(total, first, count, a, of_a, b, of_b, at):
 
 @compiled
 def sum_blocks(c, work):
-    """`A^T W A` and the markers' blocks in `sums [10 3 3, V]`: between the vertices and those at `OFFSETS`."""
+    """Sum `A^T W A` and the markers' blocks in `sums [10 3 3, V]`: the blocks between the vertices and those at `OFFSETS`."""
     (m, n), (corners, pulls) = c.surface.free.shape, c.corners
     V, sums, WA = m * n, work.sums, work.weighted
     A, W, first, count = work.A.reshape((3, 21, V)), work.W, n + 1, V - 2 * n - 2
@@ -272,7 +273,8 @@ def sum_blocks(c, work):
 
 @compiled
 def fill(c, work, damping, ridge, used):
-    """The matrix of the blocks in `U` and the first loads in `y`, by `scale` with a diagonal of 1, the ridge added to it."""
+    """Write the matrix of the blocks to `U` and the first loads to `y`, scaled by `scale` to a diagonal of 1, with the ridge
+    added."""
     (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
     ld, size = len(work.panel) // RANK, len(work.scale)
     scale[:], U[:] = 1, 0

@@ -1,7 +1,7 @@
-"""A step of force balance by machine code: what `GaussNewton.step` does, frame by frame, without gradients.
+"""One step of force balance as machine code: `GaussNewton.step`, frame by frame, without gradients.
 
-On a processor the tensor operations of a step, some six hundred, take longer to begin than to work.
-The formulas are those of `gauss_newton`, `camera_motion`, `cavity` and `kkt`.
+On a processor, calling the six hundred tensor operations of a step takes longer than computing them. The formulas are those of
+`gauss_newton`, `camera_motion`, `cavity` and `kkt`.
 """
 
 import numpy as np
@@ -20,8 +20,8 @@ gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(s
 
 @compiled
 def step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales):
-    """From a state to the next: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `weights [N]`, of the normal tractions,
-    change."""
+    """Take one step in place: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `weights [N]` of the normal tractions are
+    overwritten."""
     tau, outlier, cone, renewal, damping = scales[0], scales[1], scales[2], scales[3], scales[4]
     m, n = c.surface.free.shape
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
@@ -55,7 +55,7 @@ def step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales)
 
 @compiled
 def factored(c, work, damping, used):
-    """The matrix factored, of so many loads `b` the `U^-T b` in `y`; their products `b . M^-1 b'`, `[LOADS, LOADS]`."""
+    """Factor the matrix; write `U^-T b` to `y` for all loads `b`, and return their products `b . M^-1 b'`, `[LOADS, LOADS]`."""
     width, size, y = work.width, len(work.scale), work.y
     tried, found = 0, False
     while not found and tried < len(work.ridges):
@@ -76,7 +76,7 @@ def factored(c, work, damping, used):
 
 @compiled
 def substituted(work, solved):
-    """A sum `[3 N]` of what `factored` left in `y` becomes the solution for that sum of loads."""
+    """Turn a sum `[3 N]` of the vectors that `factored` wrote to `y` into the solution for that sum of loads."""
     backward(work.U, len(work.panel) // RANK, work.width, len(work.scale), work.inverse, solved)
     for i in range(len(work.scale)):
         solved[i] *= work.scale[i]
@@ -84,7 +84,7 @@ def substituted(work, solved):
 
 @compiled
 def stiffness_at(k, moved, tau):
-    """The camera's stiffness at a scale `tau` of the tractions' loss."""
+    """Return the camera's stiffness at a scale `tau` of the tractions' loss."""
     play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
     moved2 = 0.0  # summed in double precision
     for a in range(4):
@@ -94,7 +94,7 @@ def stiffness_at(k, moved, tau):
 
 @compiled
 def eliminated(system):
-    """Solutions of `[A b] [4, 4 + n]`, in the columns of `b`."""
+    """Solve `[A b] [4, 4 + n]` in place; the solutions are in the columns of `b`."""
     for a in range(len(system)):
         pivot = system[a, a]
         for e in range(system.shape[1]):
@@ -107,8 +107,8 @@ def eliminated(system):
 
 @compiled
 def _camera_eliminated(k, products, own, slope, moved, tau):
-    """`CameraMotion.held` and `eliminated`: how the camera follows each load, `[4, 3]`; the loads' products become those with
-    it."""
+    """Apply `CameraMotion.held` and `eliminated`: return how the camera follows each load, `[4, 3]`, and include the
+    camera in the products of the loads."""
     stiffness, system = stiffness_at(k, moved, tau), np.empty((4, 7))
     for a in range(4):
         for b in range(4):
@@ -127,7 +127,7 @@ def _camera_eliminated(k, products, own, slope, moved, tau):
 
 @compiled
 def _shares(k, products, rise, pressure, fWv, vWv, gauge):
-    """`GaussNewton._shares`: of the volume's multiplier, the forces and the pressure's change in a step."""
+    """Apply `GaussNewton._shares`: return the shares of the volume's multiplier, the forces and the pressure change in a step."""
     if k.is_open:
         return 0.0, 1.0, 0.0
     fWv, vWv = fWv - gauge[1] * (pressure - k.rest_pressure - gauge[0]), vWv + gauge[1]
@@ -139,7 +139,7 @@ def _shares(k, products, rise, pressure, fWv, vWv, gauge):
 
 @compiled
 def cavity_condition(k, rise, pressure):
-    """`CavityLaw.condition`."""
+    """Return `CavityLaw.condition`."""
     if not k.is_gas:
         return -rise, 0.0
     return gas_step(rise, pressure, k.rest_pressure, k.absolute, k.gas_volume)
@@ -147,7 +147,8 @@ def cavity_condition(k, rise, pressure):
 
 @compiled
 def border_unknowns(products, vWv, compliance, of_fluid, of_volume):
-    """`kkt.border_unknowns`: the volume's multiplier and the pressure's change, from what is on the right of their rows."""
+    """Apply `kkt.border_unknowns`: return the volume's multiplier and the pressure change from the right-hand sides of their
+    rows."""
     corner, beside = vWv - products[FLUID, FLUID], compliance - products[VOLUME, FLUID]
     change, multiplier = solution_2x2(corner, beside, -products[VOLUME, VOLUME], of_fluid, of_volume)
     return multiplier, change
@@ -155,7 +156,8 @@ def border_unknowns(products, vWv, compliance, of_fluid, of_volume):
 
 @compiled
 def _share(c, u, move):
-    """`GaussNewton._share`: so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+    """Apply `GaussNewton._share`: return the share of the step that limits the motion of every vertex and the stretch of every
+    grid edge."""
     (m, n), rest, k, tiny = c.surface.free.shape, c.surface.rest, c.numbers, 1e-30
     far2, stretch2 = 0.0, 0.0
     here = np.zeros(3)

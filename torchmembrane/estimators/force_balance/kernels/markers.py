@@ -1,6 +1,6 @@
-"""The markers' angles for one frame, by machine code, and what they add to the equations of a step.
+"""The markers' angles for one frame as machine code, and their contributions to the equations of a step.
 
-The formulas of `MarkerResiduals`, once more; a test holds both to the same numbers.
+The formulas repeat those of `MarkerResiduals`; a test compares the numbers.
 """
 
 import numpy as np
@@ -41,8 +41,8 @@ def load_markers(c, work, u, moved, seen, outlier, own, slope):
 
 @compiled
 def turned(seen, d, place, moved, jacobian, angle):
-    """`MarkerResiduals._seen`: the angles of marker d at a place, their derivatives in it, the sum of their squares; `place`
-    becomes that from the ray's origin."""
+    """Apply `MarkerResiduals._seen`: return the angles of marker d at `place`, their derivatives in it, and the sum of their
+    squares; `place` is overwritten with the vector from the ray's origin."""
     origins, across, _, motion = seen
     for a in range(3):
         place[a] -= origins[a, d]
@@ -62,7 +62,7 @@ def turned(seen, d, place, moved, jacobian, angle):
 
 @compiled
 def place_of(c, u, d, place):
-    """`MarkerResiduals.markers`: where marker d is on the surface."""
+    """Return the position of marker d on the surface as `MarkerResiduals.markers` does."""
     n, (numbers, shares) = c.surface.free.shape[1], c.smooth
     for a in range(3):
         place[a] = c.positions[d, a]

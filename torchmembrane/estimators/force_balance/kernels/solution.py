@@ -1,5 +1,4 @@
-"""What the state after the steps amounts to, by machine code: what `ForceBalance.equilibrium` says, frame by frame, without
-gradients."""
+"""The results of a state after the steps as machine code: `ForceBalance.equilibrium`, frame by frame, without gradients."""
 
 import numpy as np
 
@@ -18,8 +17,8 @@ loss_of_push = compiled(geman_mcclure_loss)
 
 @compiled
 def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, given, told, traction, reference):
-    """`told [7]`, `traction [m, n, 3]` and `reference [m, n]` of a state; `given [2]`: `cone` and how `far` off a marker
-    counts."""
+    """Compute `told [7]`, `traction [m, n, 3]` and `reference [m, n]` of a state; `given [2]`: `cone`, and the limit `far` of a
+    marker's angle."""
     (m, n), k, step2 = c.surface.free.shape, c.numbers, 0.0
     told[VOLUME] = linearise(c.surface, u, pressure, work.force, work.A, work.volume)
     scaled(c, work, noise_level, k.last_tau)
@@ -45,7 +44,8 @@ def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, g
 
 @compiled
 def _tractions(c, work, cone, told, traction):
-    """`TractionLoss.forward`: the loss of pushes, and of pulls and shear; the tractions, and the share that is pushed."""
+    """Apply `TractionLoss.forward`: return the loss of pushes and that of pulls and shear, the tractions, and the pushed
+    share of the area."""
     k, n, pushes, others, whole, pushed = c.numbers, c.surface.free.shape[1], 0.0, 0.0, 0.0, 0.0
     for i in range(len(c.area)):
         p, q, unit = i // (n - 2) + 1, i % (n - 2) + 1, k.sparsity / k.size**2 * c.area[i]
@@ -66,7 +66,8 @@ def _tractions(c, work, cone, told, traction):
 
 @compiled
 def _markers(c, u, moved, seen, far, told):
-    """`MarkerResiduals.misfits`; the markers seen, and their loss, here and at rest with a camera that has not moved."""
+    """Apply `MarkerResiduals.misfits`; return also the number of visible markers, and their loss for this state and at rest
+    with an unmoved camera."""
     weight, k, count = seen[2], c.numbers, len(seen[2])
     place, jacobian, angle, here = np.zeros(3), np.zeros((2, 3)), np.zeros(2), np.empty((count, 2))
     still, total, misfit, at_rest, counted = np.zeros_like(moved), 0.0, 0.0, 0.0, 0.0
@@ -93,5 +94,5 @@ def _markers(c, u, moved, seen, far, told):
 
 @compiled
 def _cauchy(r2, scale):
-    """`Cauchy.loss`."""
+    """Return `Cauchy.loss`."""
     return scale**2 / 2 * np.log1p(r2 / scale**2)

@@ -1,7 +1,7 @@
-"""How the markers' noise spreads into force and depth, by machine code: what `deviations.spreads` does, without gradients.
+"""Propagation of the markers' noise to force and depth as machine code: `deviations.spreads`, without gradients.
 
-With the loads' `U^-T b` all products `b . M^-1 b'` are at hand, so that only the wanted numbers' solutions, camera and cavity
-eliminated, are substituted back.
+With `U^-T b` of all loads, all products `b . M^-1 b'` are known. Only the solutions for the wanted numbers, with camera and
+cavity eliminated, need a back substitution.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from .markers import load_markers
 
 @compiled
 def spread_of(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales, found):
-    """Standard deviations `[4]` at the state of a frame."""
+    """Return the standard deviations `[4]` at the state of a frame."""
     own, slope, size = np.zeros((4, 4)), np.zeros(4), len(work.scale)
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
     weigh(c, work, weights, noise_level, scales[0], scales[2], scales[3], np.bool_(True))
@@ -45,7 +45,8 @@ def spread_of(c, work, u, pressure, moved, weights, seen, noise_level, gauge, sc
 
 @compiled
 def _load_wanted(c, work, u):
-    """Loads of the wanted: the total force's derivatives in the inner vertices and the depth's; in the pressure, `[4]`."""
+    """Write the loads of the wanted numbers: the derivatives of the total force and of the depth at the inner vertices; return
+    those in the pressure, `[4]`."""
     (m, n), loads, by_pressure, deepest, count = c.surface.free.shape, work.loads, np.zeros(4), -np.inf, 0
     N = (m - 2) * (n - 2)
     depth = work.fields[0]
@@ -68,8 +69,8 @@ def _load_wanted(c, work, u):
 
 @compiled
 def _camera_eased(products, own):
-    """`CameraMotion.eliminate_camera`: how the camera follows each load, `[4, LOADS]`; of the cavity's the products with all
-    become those with it."""
+    """Apply `CameraMotion.eliminate_camera`: return how the camera follows each load, `[4, LOADS]`, and include the camera in
+    the products of the cavity's load with all loads."""
     system = np.empty((4, 4 + LOADS))
     for a in range(4):
         for b in range(4):
@@ -87,7 +88,7 @@ def _camera_eased(products, own):
 
 @compiled
 def _at_markers(c, work, solved, own, motion):
-    """Variance of a number whose equations' solution is `solved [3 N]`, by all markers' angles."""
+    """Return the variance due to all markers' angles of a number whose equations have the solution `solved [3 N]`."""
     (corners, pulls), system, total = c.corners, np.empty((4, 5)), 0.0
     for a in range(4):
         for b in range(4):

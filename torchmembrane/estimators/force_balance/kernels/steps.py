@@ -1,4 +1,4 @@
-"""When steps of force balance are taken by machine code, and what that is given."""
+"""Interface between the estimator and the machine code of its steps: when it is used, and its arguments."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ from .spread import spread_of
 
 
 class NativeSteps:
-    """The steps of one grid. What is constant is looked up again where precision, settings or material have changed. Frames of
-    a batch are shared out among as many threads as torch has."""
+    """The steps on one grid. Constants are looked up again after a change of precision, settings or material. The frames of a
+    batch are distributed over as many threads as torch uses."""
 
     def __init__(self) -> None:
         self._constants: tuple[Any, Constants] | None = None
@@ -46,8 +46,11 @@ class NativeSteps:
         measured: MeasuredRays,
         rows: Sequence[Sequence[float]],
     ) -> list[Tensor]:
-        """Displacement, pressure and camera after the steps, the displacement before the last, and the weights; arguments as of
-        `GaussNewton.step`, `rows`: the numbers of every step."""
+        """Return displacement, pressure and camera motion after the steps, the displacement before the last step, and the
+        weights.
+
+        Arguments are those of `GaussNewton.step`; `rows`: the parameters of every step.
+        """
         constants, fixed = self._prepared(equations, cavity, measured)
         changing = [value.clone(memory_format=torch.contiguous_format) for value in (*state, weights)]
         changing.append(changing[0].clone())
@@ -67,7 +70,7 @@ class NativeSteps:
         measured: MeasuredRays,
         outlier: float,
     ) -> Tensor:
-        """Standard deviations of force and depth, `[B, 4]`; arguments as of `deviations.spreads`."""
+        """Return the standard deviations of force and depth, `[B, 4]`; arguments as for `deviations.spreads`."""
         constants, fixed = self._prepared(equations, cavity, measured)
         u, pressure, moved = (value.contiguous().numpy() for value in state)
         weights, found = np.ones((len(u), len(constants.area)), u.dtype), np.empty((len(u), 4), u.dtype)
@@ -86,8 +89,11 @@ class NativeSteps:
         measured: MeasuredRays,
         far: float,
     ) -> tuple[Sequence[Tensor], Tensor, Tensor]:
-        """What a state amounts to: the numbers `[B]` of what is `TOLD`, the tractions `[B, V, 3]` and what they are measured
-        against `[B, V]`; arguments as of `ForceBalance.equilibrium`, `far`: as of `MarkerResiduals.misfits`."""
+        """Return the results of a state: the numbers `[B]` listed in `TOLD`, the tractions `[B, V, 3]` and their references
+        `[B, V]`.
+
+        Arguments are those of `ForceBalance.equilibrium`; `far` as for `MarkerResiduals.misfits`.
+        """
         constants, fixed = self._prepared(equations, cavity, measured)
         u, pressure, moved, earlier = (value.contiguous().numpy() for value in (*state, before))
         weights, given = np.empty((len(u), 0), u.dtype), np.array([[equations.loss.cone, far, 0, 0, 0]], float)
@@ -103,13 +109,13 @@ class NativeSteps:
     def _prepared(
         self, equations: BalanceEquations, cavity: CavityLaw, measured: MeasuredRays
     ) -> tuple[Constants, list[np.ndarray]]:
-        """What is constant, and what is measured, as arrays."""
+        """Return the constants and the measurements as arrays."""
         gauge = torch.zeros_like(measured.motion[:, 0, :2, 0]) if measured.gauge is None else measured.gauge
         fixed = [value.contiguous().numpy() for value in (*measured[:5], gauge)]
         return self._found(equations, cavity, fixed[0].dtype), fixed
 
     def _shared_out(self, equations: BalanceEquations, constants: Constants, each: list[np.ndarray], rows: np.ndarray) -> None:
-        """Call `frames` with parts of what `each` frame has, of which the last is `found`, each part in a thread of its own."""
+        """Call `frames` on parts of the arrays `each`, the last of which is `found`, with one thread per part."""
         grid, dtype, threads = equations.forces.membrane.grid, each[0].dtype, min(torch.get_num_threads(), len(each[0]))
 
         def take(part: Sequence[np.ndarray]) -> None:
@@ -179,12 +185,12 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
 
 
 def _nothing(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tractions, and what they are measured against, that are not asked for."""
+    """Return placeholders for tractions and their references that are not requested."""
     return np.empty((len(u), 0, 0, 3), u.dtype), np.empty((len(u), 0, 0), u.dtype)
 
 
 def _volume(surface: Surface) -> float:
-    """At rest, eq. 19, by triangles as steps sum it up."""
+    """Return the volume at rest (eq. 19), summed over triangles in the same order as in the steps."""
     edges = surface.edges.astype(float)
     spins = np.cross(edges[:, 0], edges[:, 1], axis=0).sum(1)
     inner: np.ndarray = surface.rest[:-1, :-1].astype(float)
@@ -192,7 +198,7 @@ def _volume(surface: Surface) -> float:
 
 
 def _sparse(rows: np.ndarray, count: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers and values of what is not zero in each row, `[D, K]` each, then some that are."""
+    """Return the indices and values of the non-zero entries of each row, `[D, K]` each, padded with other entries."""
     count = count or int((rows != 0).sum(1).max())
     numbers = np.ascontiguousarray(np.argsort(rows == 0, axis=1, kind="stable")[:, :count])
     return numbers, np.take_along_axis(rows, numbers, 1)
