@@ -172,7 +172,7 @@ def _fitted(c, d, gram, system):
 
 @compiled
 def _told(c, d, gram, system, offset, moved, size, gain, mean, noise, dot, covariance):
-    """Return the covariance `[2, 2]` of a centre, and write the measurements of the window to `dot [6]`, as for `FittedDots`."""
+    """Return the covariance `[2, 2]` of a centre, and write the window's measurements to `dot [6]`, as for `FittedDots`."""
     stride, unit, missed = c.scales[d, 0], c.scales[d, 3], np.float32(0)
     for a in range(FIELDS):
         along = -gram[a, 7]

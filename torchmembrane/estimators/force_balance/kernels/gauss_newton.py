@@ -127,7 +127,7 @@ def _camera_eliminated(k, products, own, slope, moved, tau):
 
 @compiled
 def _shares(k, products, rise, pressure, fWv, vWv, gauge):
-    """Apply `GaussNewton._shares`: return the shares of the volume's multiplier, the forces and the pressure change in a step."""
+    """Apply `GaussNewton._shares`: return the shares of the volume's multiplier, forces and pressure change in a step."""
     if k.is_open:
         return 0.0, 1.0, 0.0
     fWv, vWv = fWv - gauge[1] * (pressure - k.rest_pressure - gauge[0]), vWv + gauge[1]
