@@ -9,6 +9,7 @@ import os
 import re
 import zipfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -128,16 +129,9 @@ def arrays(draw: st.DrawFn, data: bytes) -> bytes:
     way = draw(st.sampled_from(["damaged", "damaged", "changed", "changed", "bomb"]))
     if way == "damaged":
         return draw(damaged(data))
-    out = io.BytesIO()
     if way == "bomb":
-        with (
-            zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as file,
-            file.open("vertices.npy", "w", force_zip64=True) as member,
-        ):
-            np.lib.format.write_array_header_1_0(member, dict(descr="<f8", fortran_order=False, shape=(8000, 8000, 3)))
-            for _ in range(100):
-                member.write(bytes(2**20))
-        return out.getvalue()
+        return bomb()
+    out = io.BytesIO()
     with np.load(io.BytesIO(data)) as file:
         held = dict(file)
     for name in draw(st.lists(st.sampled_from(sorted(held)), min_size=1, max_size=2, unique=True)):
@@ -145,6 +139,20 @@ def arrays(draw: st.DrawFn, data: bytes) -> bytes:
     if draw(st.integers(0, 9)) == 9:
         del held[draw(st.sampled_from(sorted(held)))]
     np.savez_compressed(out, **held)
+    return out.getvalue()
+
+
+@cache
+def bomb() -> bytes:
+    """An .npz of 100 kB that unpacks to 100 MB of zeros."""
+    out = io.BytesIO()
+    with (
+        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as file,
+        file.open("vertices.npy", "w", force_zip64=True) as member,
+    ):
+        np.lib.format.write_array_header_1_0(member, dict(descr="<f8", fortran_order=False, shape=(8000, 8000, 3)))
+        for _ in range(100):
+            member.write(bytes(2**20))
     return out.getvalue()
 
 
