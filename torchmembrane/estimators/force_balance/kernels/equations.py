@@ -1,8 +1,8 @@
 """The equations of one force-balance step for one frame, as machine code: weights, loads and matrix.
 
-The formulas repeat those of `contact_force`, `traction_loss`, `marker_residuals` and `normal_equations`, where they are explained;
-a test compares the numbers. Vertices are numbered `k = i n + j` on the whole grid, except in arrays of length `N`, which have
-the inner vertices only.
+The formulas repeat those of `contact_force`, `traction_loss`, `marker_residuals` and `normal_equations`, where they are
+explained; a test compares the numbers. Vertices are numbered `k = i n + j` on the whole grid, except in arrays of length `N`,
+which have the inner vertices only.
 """
 
 from typing import Any, NamedTuple
