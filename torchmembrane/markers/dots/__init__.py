@@ -1,4 +1,4 @@
-"""Markers that are dots, of one size or two: found in the rest image, located in every other."""
+"""Markers that are dots of one or two sizes: found in the rest image, and located in every other image."""
 
 from .locator import DotLocator
 from .pattern import DotPattern, find_dots, measure_dots

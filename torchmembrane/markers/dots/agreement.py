@@ -1,4 +1,4 @@
-"""Which blob is which dot, so that neighbours agree on where they went: belief propagation on the pattern's triangles."""
+"""Assignment of blobs to dots in which neighbours agree on their motion: belief propagation on the pattern's triangles."""
 
 from math import log
 
@@ -16,7 +16,8 @@ EXCHANGES = 20  # of messages between all neighbours
 
 
 def edges(pixels: np.ndarray) -> np.ndarray:
-    """Pairs `[E, 2]` of the neighbours among `pixels [D, 2]`: the edges of the Delaunay triangles, without the long ones."""
+    """Return the pairs `[E, 2]` of neighbours among `pixels [D, 2]`: the edges of the Delaunay triangles, without the long
+    ones."""
     corners = Delaunay(pixels, qhull_options="QJ Pp").simplices  # joggled: dots may be in one row
     pairs = np.unique(np.sort(corners[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), 1), axis=0)
     length, pitch = np.linalg.norm(np.diff(pixels[pairs], axis=1)[:, 0], axis=1), spacing(pixels)[1]
@@ -26,19 +27,21 @@ def edges(pixels: np.ndarray) -> np.ndarray:
 class NeighbourAgreement(nn.Module):
     """Assigns blobs to the dots of a pattern so that the steps between neighbours are as expected.
 
-    Minimises over every dot's choice `k`, one of its candidates or none, `sum_d c_d(k_d) + sum_(d,e) min(|r_de|^2 / 2 s_de^2,
-    DOUBT)`. `r_de` is the step from blob `k_d` to blob `k_e` less the one expected, `s_de` is `PREDICTION` times its length at
-    rest.
-    Loopy min-sum belief propagation (Pearl 1988; Weiss and Freeman 2001): messages along the edges are exchanged a fixed number
-    of times. It knows no membrane: any flow will do whose steps change by up to about half from one dot to the next.
+    Each dot chooses one of its candidates or none. The choices `k` minimise `sum_d c_d(k_d) + sum_(d,e) min(|r_de|^2 / 2
+    s_de^2, DOUBT)`, where `r_de` is the step from blob `k_d` to blob `k_e` minus the expected one, and `s_de` is `PREDICTION`
+    times the length of the step at rest.
+
+    The method is loopy min-sum belief propagation (Pearl 1988; Weiss and Freeman 2001) with a fixed number of exchanges of
+    messages along the edges. It assumes no membrane: the steps of the flow may change by up to about half from one dot to the
+    next.
 
     Args:
-        pixels: centres `[D, 2]` of the dots at rest, px.
-        seen: `[D]` bool, which of them are in the image at rest: for the others it costs nothing to be lost.
+        pixels: centres of the dots at rest, `[D, 2]`, px.
+        seen: which of them are in the image at rest, `[D]` bool; the others can be lost without cost.
 
     Limitations:
-        The choice of least cost is found as a rule, not always. Where the pattern is a lattice, one that has moved by a step
-        of the lattice is told from one at rest by its outline alone.
+        The choice of least cost is usually found, but not always. If the pattern is a lattice, a motion by one lattice step is
+        distinguished from rest by the lattice's outline alone.
     """
 
     source: Tensor
@@ -68,15 +71,15 @@ class NeighbourAgreement(nn.Module):
         self.register_buffer("reach", torch.as_tensor((REACH * pitch) ** 2)[:, None])
 
     def forward(self, expected: Tensor, blobs: Tensor, misfit: Tensor) -> tuple[Tensor, Tensor]:
-        """Each dot's blob.
+        """Assign a blob to each dot.
 
         Args:
-            expected: where the dots are expected `[B, D, 2]`, px.
-            blobs: `[B, K, 2]`, px.
-            misfit: `[B, D, K]`, of the blobs' sizes, squared standard deviations.
+            expected: expected positions of the dots, `[B, D, 2]`, px.
+            blobs: positions of the blobs, `[B, K, 2]`, px.
+            misfit: misfit of the blobs' sizes, `[B, D, K]`, squared standard deviations.
 
         Returns:
-            The blobs `[B, D, 2]` px; which dots have one `[B, D]`, 0 or 1.
+            The assigned blobs, `[B, D, 2]` px, and whether each dot has one, `[B, D]`, 0 or 1.
         """
         places, own, pair, messages = self.begin(expected, blobs, misfit)
         (messages,) = fori_loop(self.exchange, EXCHANGES, (messages,), own, pair)
@@ -84,8 +87,8 @@ class NeighbourAgreement(nn.Module):
 
     @traced
     def begin(self, expected: Tensor, blobs: Tensor, misfit: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Candidates `[B, D, C, 2]`, what each costs and at last what none does `[B, D, C + 1]`, what pairs of them cost
-        `[B, E, C + 1, C + 1]`, first messages `[B, E, C + 1]`."""
+        """Return the candidates `[B, D, C, 2]`, the cost of each and, last, of none `[B, D, C + 1]`, the cost of pairs of
+        candidates `[B, E, C + 1, C + 1]`, and the first messages `[B, E, C + 1]`."""
         middle = expected.mean(1, keepdim=True)
         square = square_distance(expected - middle, blobs - middle)
         cost = square * self.pull + (0.5 * misfit).clamp(max=DOUBT) + FAR * (square > self.reach).to(square.dtype)
@@ -101,20 +104,20 @@ class NeighbourAgreement(nn.Module):
 
     @traced
     def exchange(self, messages: Tensor, own: Tensor, pair: Tensor) -> tuple[Tensor]:
-        """The next messages `[B, E, C + 1]`: what each choice of an edge's end costs its beginning and all behind that, damped
-        by a mean with those before."""
+        """Return the next messages `[B, E, C + 1]`: the cost of each choice at the end of an edge for its beginning and for all
+        dots behind that, averaged with the previous messages for damping."""
         behind = self.beliefs(messages, own).index_select(1, self.source) - messages.index_select(1, self.reverse)
         told = (behind[..., None] + pair).amin(-2)
         return ((messages + told - told.amin(-1, keepdim=True)) / 2,)
 
     def beliefs(self, messages: Tensor, own: Tensor) -> Tensor:
-        """What each choice costs in all, `[B, D, C + 1]`."""
+        """Return the total cost of each choice, `[B, D, C + 1]`."""
         told = torch.cat([messages, torch.zeros_like(messages[:, :1])], 1)
         return own + told.index_select(1, self.incoming.flatten()).unflatten(1, self.incoming.shape).sum(2)
 
     @traced
     def end(self, messages: Tensor, own: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-        """The choices of least cost, as `forward` returns them."""
+        """Return the choices of least cost, in the form of `forward`."""
         choice = self.beliefs(messages, own).argmin(-1)
         found = choice < places.shape[2]
         taken = choice.clamp(max=places.shape[2] - 1)[..., None, None].expand(-1, -1, 1, 2)

@@ -1,4 +1,4 @@
-"""Where a pattern is as a whole: the shift on which most dots agree, then an affine map."""
+"""Position of a pattern as a whole: the shift on which most dots agree, then an affine map."""
 
 import numpy as np
 import torch
@@ -15,15 +15,16 @@ VOTE = 0.4  # pitches: width of a vote, distance of the shifts, and about where 
 
 
 class Alignment(nn.Module):
-    """Lays a pattern on the blobs of a frame as a whole.
+    """Aligns a pattern as a whole with the blobs of a frame.
 
-    There are two starts: where the dots were, and the rest pattern under the median of the deformation measured at the blobs.
-    For each, all pairs of a dot and a blob vote for a shift, small ones with more weight. The start with the most votes is
-    brought onto the blobs by an affine map, in a few steps of expectation and maximisation (after Myronenko and Song 2010).
+    There are two starts: the previous positions of the dots, and the rest pattern under the median of the deformation measured
+    at the blobs. For each start, all pairs of a dot and a blob vote for a shift; small shifts have more weight. The start with
+    the most votes is then aligned with the blobs by an affine map, in a few expectation-maximisation steps (after Myronenko and
+    Song 2010).
 
     Args:
-        pixels: centres `[D, 2]` of the dots at rest about their mean, px.
-        seen: `[D]` bool, which of them are in the image at rest: no other has a vote.
+        pixels: centres of the dots at rest relative to their mean, `[D, 2]`, px.
+        seen: which of them are in the image at rest, `[D]` bool; only these vote.
     """
 
     pixels: Tensor
@@ -45,14 +46,14 @@ class Alignment(nn.Module):
 
     @traced
     def forward(self, before: Tensor, blobs: Tensor, misfit: Tensor, deformation: Tensor, valid: Tensor) -> Tensor:
-        """Where the dots are expected.
+        """Return the expected positions of the dots.
 
         Args:
-            before: where they were `[B, D, 2]`, px about the pattern's mean at rest, as all places here.
-            blobs: `[B, K, 2]`, px.
-            misfit: `[B, D, K]`, of the blobs' sizes, squared standard deviations.
-            deformation: at the blobs `[B, 2, 2, K]`.
-            valid: how surely each is a dot `[B, K]`, in 0..1.
+            before: previous positions, `[B, D, 2]`, px; all positions here are relative to the pattern's mean at rest.
+            blobs: positions of the blobs, `[B, K, 2]`, px.
+            misfit: misfit of the blobs' sizes, `[B, D, K]`, squared standard deviations.
+            deformation: deformation gradient at the blobs, `[B, 2, 2, K]`.
+            valid: probability that each blob is a dot, `[B, K]`, in 0..1.
 
         Returns:
             `[B, D, 2]`, px.
@@ -67,7 +68,7 @@ class Alignment(nn.Module):
         return place
 
     def shifted(self, place: Tensor, blobs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """`place [B, D, 2]` after the shift with the most votes, and these `[B]`."""
+        """Return `place [B, D, 2]` after the shift with the most votes, and the number of these votes `[B]`."""
         square = square_distance(place, blobs)
         near = square / (2 * (REACH * self.unit) ** 2) - weight.clamp_min(LEAST).log()
         index = near.topk(min(CANDIDATES, blobs.shape[1]), largest=False).indices
@@ -81,7 +82,7 @@ class Alignment(nn.Module):
         return place + self.unit * shift[:, None], most
 
     def mapped(self, place: Tensor, blobs: Tensor, weight: Tensor, width: Tensor) -> Tensor:
-        """`place [B, D, 2]` after a step of an affine map onto the blobs within about `width` px."""
+        """Return `place [B, D, 2]` after one step of an affine map onto the blobs within about `width` px."""
         near = torch.exp(-square_distance(place, blobs) / (2 * width**2)) * weight
         near = near / (near.sum(-1, keepdim=True) + NONE)
         near = near / near.sum(1, keepdim=True).clamp_min(1)  # a blob is one dot's

@@ -1,4 +1,4 @@
-"""Linear maps of image rows as narrow band matrices: blur, interpolation, means."""
+"""Linear maps of image rows as narrow band matrices: blur, interpolation and averages."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ BLOCK = 32  # rows of a band matrix that are multiplied at once
 
 
 def blur_rows(size: int, sigma: float, rows: np.ndarray) -> np.ndarray:
-    """`[len(rows), size]`: a Gaussian about each of `rows` over `size` pixels, the border's repeated beyond it."""
+    """Return the Gaussian weights around each of `rows` over `size` pixels, `[len(rows), size]`; border pixels are repeated."""
     reach = int(np.ceil(2.5 * sigma))
     step = np.arange(-reach, reach + 1)
     kernel = np.exp(-0.5 * (step / sigma) ** 2)
@@ -19,7 +19,7 @@ def blur_rows(size: int, sigma: float, rows: np.ndarray) -> np.ndarray:
 
 
 def linear_rows(size: int, rows: np.ndarray) -> np.ndarray:
-    """`[len(rows), size]`: linear interpolation of `size` values at `rows`, which need not be whole.
+    """Return the weights of linear interpolation of `size` values at fractional `rows`, `[len(rows), size]`.
 
     Example:
         >>> (linear_rows(3, np.array([0.25, 2.0])) @ [0.0, 10.0, 20.0]).tolist()
@@ -34,12 +34,13 @@ def linear_rows(size: int, rows: np.ndarray) -> np.ndarray:
 
 
 def pair_means(size: int) -> np.ndarray:
-    """`[size // 2, size]`: means of pairs; a last one without a partner is left out."""
+    """Return the weights of the means of pairs, `[size // 2, size]`; a last value without a partner is omitted."""
     return np.pad(np.kron(np.eye(size // 2), [0.5, 0.5]), ((0, 0), (0, size % 2)))
 
 
 def bands(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A narrow band `matrix [m, n]` by blocks of rows `[N, BLOCK, width]`, zero beyond `m`, and their columns `[N, width]`."""
+    """Return a band `matrix [m, n]` as blocks of rows `[N, BLOCK, width]`, padded with zeros beyond `m`, and their columns `[N,
+    width]`."""
     blocks = np.pad(matrix, ((0, -len(matrix) % BLOCK), (0, 0))).reshape(-1, BLOCK, matrix.shape[1])
     ends = np.array([np.flatnonzero(block.any(0))[[0, -1]] for block in blocks])
     width = (ends[:, 1] - ends[:, 0]).max() + 1
@@ -48,7 +49,7 @@ def bands(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class BandProduct(nn.Module):
-    """Product of a band matrix with the columns of images, block by block, transposed: `(matrix @ image)^T`."""
+    """Multiplies the columns of images by a band matrix, block by block; the result is transposed: `(matrix @ image)^T`."""
 
     blocks: Tensor
     columns: Tensor
@@ -60,13 +61,13 @@ class BandProduct(nn.Module):
         self.register_buffer("columns", torch.as_tensor(columns))
 
     def forward(self, image: Tensor) -> Tensor:
-        """`[B, 1, n, W]` -> `[B, 1, W, m]`, `m` filled up with zeros to whole blocks."""
+        """Map `[B, 1, n, W]` to `[B, 1, W, m]`, with `m` padded with zeros to whole blocks."""
         parts = image.index_select(-2, self.columns.flatten()).unflatten(-2, self.columns.shape)
         return (self.blocks @ parts).flatten(-3, -2).mT
 
 
 class SeparableMap(nn.Module):
-    """`along_v @ image @ along_u^T`, without the pixels that the two matrices do not look at."""
+    """Computes `along_v @ image @ along_u^T`, without the pixels that have no weight in either matrix."""
 
     along_v: Tensor
     along_u: Tensor
@@ -78,11 +79,11 @@ class SeparableMap(nn.Module):
         self.register_buffer("along_u", torch.as_tensor(along_u[:, self.columns].T.copy()))
 
     def forward(self, image: Tensor) -> Tensor:
-        """`[..., H, W]` -> `[..., rows of along_v, rows of along_u]`."""
+        """Map `[..., H, W]` to `[..., rows of along_v, rows of along_u]`."""
         return self.along_v @ image[..., self.rows, self.columns] @ self.along_u
 
 
 def _used(matrix: np.ndarray) -> slice:
-    """From the first to the last column of `matrix` that is not zero."""
+    """Return the slice from the first to the last non-zero column of `matrix`."""
     columns = np.flatnonzero(matrix.any(0))
     return slice(int(columns[0]), int(columns[-1]) + 1)

@@ -1,4 +1,4 @@
-"""Compact dark blobs in one image, found without any prior."""
+"""Detection of compact dark blobs in one image, without prior knowledge of the pattern."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ SOLIDITY = 0.75  # of its ellipse that a dot fills, or a dot that its ellipse fi
 
 
 class Blob(NamedTuple):
-    """What the pixels of one blob are: how many, their mean, second moments `[2, 2]` and contrast."""
+    """Statistics of the pixels of one blob: their number, mean, second moments `[2, 2]` and contrast."""
 
     area: int
     centre: np.ndarray
@@ -26,7 +26,8 @@ class Blob(NamedTuple):
 
 
 def blob_seeds(dark: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Maxima `[S, 2]` (u, v) over place and scale of the Hessian's determinant, and their radii `[S]`, best first."""
+    """Return the maxima `[S, 2]` (u, v) of the Hessian's determinant over position and scale, and their radii `[S]`, best
+    first."""
     count = max(1, int(np.log(min(dark.shape) * LARGEST / SMALLEST) / np.log(SCALES)) + 1)
     radii = SMALLEST * SCALES ** np.arange(count)
     series = fft.dctn(dark.astype(np.float32))
@@ -40,7 +41,7 @@ def blob_seeds(dark: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _maxima(values: np.ndarray, least: float) -> np.ndarray:
-    """Indices `[N, 3]` of the `values [A, B, C]` above `least`, not negative, that none of the 26 around them exceeds."""
+    """Return the indices `[N, 3]` of the `values [A, B, C]` above `least` (>= 0) that none of their 26 neighbours exceeds."""
     peak = values > least
     for axis in range(3):  # of the six nearest first: few are left for the others
         above, of = np.moveaxis(peak, axis, 0), np.moveaxis(values, axis, 0)
@@ -52,12 +53,13 @@ def _maxima(values: np.ndarray, least: float) -> np.ndarray:
 
 
 def second_derivatives(image: np.ndarray, series: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Those of an image that goes on mirrored, smoothed by a Gaussian of `sigma` px: vv, uu and uv, `[H, W]` each.
+    """Return the second derivatives vv, uu and uv, `[H, W]` each, of an image smoothed by a Gaussian; borders are mirrored.
 
     Args:
-        image: `[H, W]`.
-        series: `scipy.fft.dctn` of it. From `LONG_FILTER` on each of its terms is smoothed and derived exactly.
-        sigma: px.
+        image: the image, `[H, W]`.
+        series: `scipy.fft.dctn` of the image. If `sigma` is at least `LONG_FILTER`, each of its terms is smoothed and
+            differentiated exactly.
+        sigma: standard deviation of the Gaussian, px.
 
     Example:
         >>> image = np.random.default_rng(0).random((30, 40))
@@ -78,7 +80,7 @@ def second_derivatives(image: np.ndarray, series: np.ndarray, sigma: float) -> t
 
 
 def grow_blob(dark: np.ndarray, seed: np.ndarray, radius: float) -> Blob | None:
-    """The pixels about `seed` (u, v) that are darker than half way to the background, or None where they are no blob."""
+    """Return the pixels around `seed` (u, v) that are darker than half way to the background; None if they are no blob."""
     reach = int(np.ceil(2.6 * radius)) + 2
     v0, u0 = max(seed[1] - reach, 0), max(seed[0] - reach, 0)
     patch = dark[v0 : seed[1] + reach + 1, u0 : seed[0] + reach + 1]
@@ -101,7 +103,7 @@ def grow_blob(dark: np.ndarray, seed: np.ndarray, radius: float) -> Blob | None:
 
 
 def is_dot(area: float, moments: np.ndarray, filled: float) -> bool:
-    """Whether a blob is an ellipse: compact, and its area what its moments say, up to a factor of exp(`filled`).
+    """Whether a blob is a compact ellipse: its area agrees with its moments up to a factor of exp(`filled`).
 
     Example:
         >>> is_dot(4 * np.pi * 9, 9 * np.eye(2), 0.1), is_dot(4 * np.pi * 6, 9 * np.eye(2), 0.1)
@@ -120,17 +122,17 @@ def check_count(count: int) -> None:
 
 
 def find_blobs(dark: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every compact dark blob of an image.
+    """Find every compact dark blob of an image.
 
     Args:
-        dark: image `[H, W]` in 0..1, dots dark.
-        mask: `[H, W]` bool, where to look, or None: everywhere.
+        dark: image `[H, W]` in 0..1, with dark dots.
+        mask: where to search, `[H, W]` bool; None: everywhere.
 
     Returns:
         Centres `[N, 2]` px, shapes `[N, 2, 2]` px, contrasts `[N]`.
 
     Raises:
-        MembraneError: fewer than 6 are found.
+        MembraneError: fewer than 6 blobs are found.
     """
     smooth = ndimage.gaussian_filter(dark, 0.6)
     taken = np.zeros(dark.shape, bool)
@@ -155,6 +157,6 @@ def find_blobs(dark: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.nda
 
 
 def _ellipse(blob: Blob) -> np.ndarray:
-    """Shape `[2, 2]` px with the blob's area and axes along those of its moments."""
+    """Return the shape `[2, 2]` px of the ellipse with the blob's area and the axes of its moments."""
     values, axes = np.linalg.eigh(blob.moments)
     return axes @ np.diag(2 * np.sqrt(values)) @ axes.T * np.sqrt(blob.area / (4 * np.pi * np.sqrt(values.prod())))

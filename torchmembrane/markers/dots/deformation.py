@@ -1,4 +1,4 @@
-"""The deformation at every blob of a frame, from the arrangement of the blobs around it alone."""
+"""Deformation at every blob of a frame, from the arrangement of the blobs around it alone."""
 
 import numpy as np
 import torch
@@ -14,11 +14,11 @@ FITS = 6  # of a deformation to the blobs around
 
 
 def monomial_map() -> Tensor:
-    """The linear map from a matrix's entries to how it acts on monomials.
+    """Return the linear map from the entries of a matrix to its action on monomials.
 
     Returns:
-        `[8, 24]`: of `A = [[a, b], [c, d]]`, `a b c d a^2+c^2 ab+cd b^2+d^2 1` to the matrix `[4, 6]` that takes monomials
-        `u v uu uv vv 1` of `x` to `A x`, `|A x|^2` and 1.
+        `[8, 24]`: for `A = [[a, b], [c, d]]`, the map from `a b c d a^2+c^2 ab+cd b^2+d^2 1` to the matrix `[4, 6]` that maps
+        the monomials `u v uu uv vv 1` of `x` to `A x`, `|A x|^2` and 1.
     """
     matrix = np.zeros((8, 4, 6))
     matrix[np.arange(8), [0, 0, 1, 1, 2, 2, 2, 3], [0, 1, 0, 1, 2, 3, 4, 5]] = [1, 1, 1, 1, 1, 2, 1, 1]
@@ -26,14 +26,14 @@ def monomial_map() -> Tensor:
 
 
 class LocalDeformation(nn.Module):
-    """The deformation gradient at every blob of a frame, from the arrangement of the blobs around it alone.
+    """Measures the deformation gradient at every blob of a frame from the arrangement of the blobs around it alone.
 
-    The dots next to the rest dot at that place are mapped by `A`, laid on the nearest blobs, and `A` fitted, a fixed
-    number of times, with an average over nearby blobs between. Nothing needs to be known of which blob is which dot.
-    Blobs are the last axis throughout.
+    The neighbours of the rest dot at that place are mapped by `A` and matched to the nearest blobs, then `A` is fitted, a fixed
+    number of times; between the fits it is averaged over nearby blobs. It need not be known which blob is which dot. Blobs are
+    the last axis throughout.
 
     Args:
-        pixels: centres `[D, 2]` of the dots at rest, px.
+        pixels: centres of the dots at rest, `[D, 2]`, px.
     """
 
     pixels: Tensor
@@ -56,7 +56,7 @@ class LocalDeformation(nn.Module):
         self.register_buffer("identity", torch.tensor([[1e-6], [0.0], [0.0], [1e-6], [1e-6]], dtype=torch.float64))
 
     def forward(self, blobs: Tensor, valid: Tensor) -> Tensor:
-        """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
+        """Return the gradient `[B, 2, 2, K]` for `blobs [B, K, 2]` with `valid [B, K]` in 0..1."""
         first, *scene = self.begin(blobs, valid)
         gradient: Tensor
         (gradient,) = fori_loop(self.refine, FITS, (first,), *scene, valid)
@@ -64,12 +64,12 @@ class LocalDeformation(nn.Module):
 
     @traced
     def begin(self, blobs: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What the fits need of a frame.
+        """Prepare the fits of a frame.
 
         Returns:
-            A first gradient `[B, 2, 2, K]`; monomials `[B, K, 6, M]` of the dots around; of the blobs beside, in pitches,
-            what their square distance needs `[B, K, 4, C]`, and positions and validity `[B, K, 3, C]`; how near all
-            blobs (columns) have the others `[B, K, K]`.
+            A first gradient `[B, 2, 2, K]`; monomials of the surrounding dots `[B, K, 6, M]`; for the neighbouring blobs, in
+            pitches, the terms of their squared distance `[B, K, 4, C]`, and their positions and validity `[B, K, 3, C]`; the
+            weights of all blobs (columns) for the averages of the others `[B, K, K]`.
         """
         middle = self.pixels.mean(0)
         own = square_distance(blobs - middle, self.pixels - middle).argmin(-1)
@@ -91,7 +91,7 @@ class LocalDeformation(nn.Module):
     def refine(
         self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor
     ) -> tuple[Tensor]:
-        """The gradient after another fit, with blobs believed up to about `WIDTH` pitches off; the rest as of `begin`."""
+        """Return the gradient after another fit to blobs within about `WIDTH` pitches; the other arguments are from `begin`."""
         a, b, c, d = gradient.flatten(1, 2).unbind(1)
         entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
         mapped = (entries * (-0.5 / WIDTH**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around

@@ -1,4 +1,4 @@
-"""Dark blobs at the pattern's scales, in a batch of frames."""
+"""Detection of dark blobs at the pattern's scales, in a batch of frames."""
 
 from functools import reduce
 
@@ -18,9 +18,9 @@ Span = tuple[int, int]
 
 
 class HessianScale(nn.Module):
-    """The normalised Hessian's determinant at one scale, on the cells of a box.
+    """Computes the normalised Hessian's determinant at one scale, on the cells of a box.
 
-    The Gaussian is two products with constant band matrices, on the level of the pyramid that suits the scale.
+    The Gaussian filter is a product with a constant band matrix along each axis, on the pyramid level that suits the scale.
     """
 
     def __init__(self, level: int, sigma: float, cell: int, box: tuple[Span, Span], size: tuple[int, int]):
@@ -39,7 +39,7 @@ class HessianScale(nn.Module):
             self.spread = SeparableMap(*(linear_rows(len(on) - 2, x) for on, x in zip(rows, at, strict=True)))
 
     def forward(self, levels: list[Tensor]) -> Tensor:
-        """`sigma^4 det Hessian` where the image is darkest, else 0, `[B, 1, rows, columns]` of the cells."""
+        """Return `sigma^4 det Hessian` of the cells where the image is a dark maximum, else 0, `[B, 1, rows, columns]`."""
         blurred = self.blur_u(self.blur_v(levels[self.level]))
         above, middle, below = (blurred[..., n : n + self.rows, :] for n in range(3))
         left, centre, right = (slice(n, n + self.columns) for n in range(3))
@@ -54,20 +54,20 @@ class HessianScale(nn.Module):
 
 
 class BlobDetector(nn.Module):
-    """The strongest dark blobs: maxima over place and scale of the normalised Hessian's determinant.
+    """Finds the strongest dark blobs: maxima of the normalised Hessian's determinant over position and scale.
 
-    Only the box that holds the membrane is looked at. Maxima are looked for on cells of 2 x 2 pixels of the finest level
-    in use, of up to `PREDICTION` times the pitch, and interpolated by a parabola.
+    Only the box that contains the membrane is searched. Maxima are searched on cells of at least 2 x 2 pixels of the finest
+    level in use, of up to `PREDICTION` times the pitch, and interpolated by a parabola.
 
     Args:
-        radii: of the pattern's dots `[D]`, px; their 5th to 95th percentile spans the scales.
-        pitch: smallest distance of two dots, px.
-        count: how many blobs are wanted.
-        inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
+        radii: radii of the pattern's dots, `[D]`, px; their 5th to 95th percentiles span the scales.
+        pitch: smallest distance between two dots, px.
+        count: number of blobs to return.
+        inside: 1 on the membrane, else 0, `[1, 1, H, W]`.
 
     Limitations:
-        Two blobs nearer than `PREDICTION` times `pitch` are one. Where there are fewer than `count`, others of strength about
-        0 fill up the list.
+        Two blobs closer than `PREDICTION` times `pitch` are found as one. If there are fewer than `count` blobs, others of a
+        strength of about 0 complete the list.
     """
 
     sides: Tensor
@@ -113,7 +113,7 @@ class BlobDetector(nn.Module):
         return self._centre(peak, cell, strength), log_radius, strength
 
     def _centre(self, peak: Tensor, cell: Tensor, strength: Tensor) -> Tensor:
-        """Centres `[B, K, 2]` px of the maxima at `cell [B, K]`, by a parabola through the cells beside each."""
+        """Return the centres `[B, K, 2]` px of the maxima at `cell [B, K]`, by a parabola through the neighbouring cells."""
         rows, columns = peak.shape[-2:]
         sides = (cell[..., None] + self.sides).clamp(0, rows * columns - 1)
         beside = peak.flatten(1).gather(1, sides.flatten(1)).unflatten(1, (-1, 2, 2))  # [B, K, uv, before or after]
@@ -124,7 +124,7 @@ class BlobDetector(nn.Module):
 
 
 def highest_around(field: Tensor, reach: int) -> Tensor:
-    """The largest value within `reach` rows and columns of every entry of `field [..., H, W]`, which is nowhere negative.
+    """Return the largest value within `reach` rows and columns of every entry of `field [..., H, W]`, which is not negative.
 
     Example:
         >>> highest_around(torch.tensor([[0.0, 1.0, 0.0, 5.0, 4.0]]), 1).tolist()
@@ -140,7 +140,7 @@ def highest_around(field: Tensor, reach: int) -> Tensor:
 
 
 def pair_maxima(field: Tensor) -> Tensor:
-    """The largest of every 2 x 2 entries of `field [..., H, W]`, of even sides.
+    """Return the maximum of every 2 x 2 block of `field [..., H, W]`, whose sides are even.
 
     Example:
         >>> pair_maxima(torch.tensor([[1.0, 0.0, 0.0, 2.0], [0.0, 3.0, 0.0, 0.0]])).tolist()
@@ -153,18 +153,19 @@ def pair_maxima(field: Tensor) -> Tensor:
 
 
 def _span(lit: np.ndarray, block: int) -> Span:
-    """From which pixel to before which, in whole blocks, all of `lit` lies."""
+    """Return the first pixel and the end, in whole blocks, of the range that contains all of `lit`."""
     on = np.flatnonzero(lit)
     return int(on[0]) // block * block, min(-(-(int(on[-1]) + 1) // block), len(lit) // block) * block
 
 
 def _cells(span: Span, cell: int) -> np.ndarray:
-    """Centres of the cells of a span, px."""
+    """Return the centres of the cells of a span, px."""
     return np.arange(*span, cell) + (cell - 1) / 2
 
 
 def _background_rows(centres: np.ndarray, side: int) -> np.ndarray:
-    """From a row of `side` pixels on the coarsest level to its means over about 8 pixels of the level, at `centres` px."""
+    """Return the weights that map a row of `side` pixels on the coarsest level to its means over about 8 pixels of the level,
+    at `centres` px."""
     coarse = side // 2 ** (LEVELS - 1)
     at = (centres / 2 ** (LEVELS - 1) - (2 ** (LEVELS - 1) - 1) / 2**LEVELS - 0.5) / 2
     smooth = blur_rows(coarse // 2, 2.0, np.arange(coarse // 2)) @ pair_means(coarse)

@@ -1,4 +1,4 @@
-"""A dot's outline in the image, an ellipse: pixel = centre + shape @ (unit circle)."""
+"""A dot's elliptical outline in the image: pixel = centre + shape @ (unit circle)."""
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ TOLERANCE = 0.45
 
 
 def half_axes(shapes: np.ndarray) -> np.ndarray:
-    """Long and short half axis `[D, 2]` of the ellipses `shapes [D, 2, 2]`.
+    """Return the long and short half axes `[D, 2]` of the ellipses `shapes [D, 2, 2]`.
 
     Example:
         >>> half_axes(np.array([[[0.0, 2.0], [5.0, 0.0]]])).tolist()
@@ -20,7 +20,7 @@ def half_axes(shapes: np.ndarray) -> np.ndarray:
 
 
 def log_radii(shapes: np.ndarray) -> np.ndarray:
-    """Logarithm `[D]` of the radii of circles as large as the ellipses `shapes [D, 2, 2]`.
+    """Return the logarithms `[D]` of the radii of circles with the areas of the ellipses `shapes [D, 2, 2]`.
 
     Example:
         >>> np.exp(log_radii(np.array([[[0.0, 2.0], [8.0, 0.0]]]))).tolist()
@@ -30,16 +30,16 @@ def log_radii(shapes: np.ndarray) -> np.ndarray:
 
 
 def rms_half_axes(shapes: np.ndarray) -> np.ndarray:
-    """Root mean square `[D]` of the two half axes of the ellipses `shapes [D, 2, 2]`."""
+    """Return the root mean square `[D]` of the two half axes of the ellipses `shapes [D, 2, 2]`."""
     return np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5
 
 
 def size_tolerance(shapes: np.ndarray, sizes: np.ndarray) -> float:
-    """Standard deviation of a dot's log radius: wide, but less than half of what separates two sizes.
+    """Return the standard deviation of a dot's log radius: large, but less than half of the difference between two sizes.
 
     Args:
-        shapes: `[D, 2, 2]`, px.
-        sizes: `[D]` int, 0 = small, 1 = large.
+        shapes: shapes of the dots, `[D, 2, 2]`, px.
+        sizes: sizes of the dots, `[D]` int, 0 = small, 1 = large.
 
     Example:
         >>> size_tolerance(np.tile(np.eye(2), (3, 1, 1)), np.ones(3, int))
@@ -52,11 +52,11 @@ def size_tolerance(shapes: np.ndarray, sizes: np.ndarray) -> float:
 
 
 def draw_dots(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int]) -> Tensor:
-    """The pattern as dark dots on white.
+    """Draw the pattern as dark dots on white.
 
     Args:
-        pixels: centres `[D, 2]`, px.
-        shapes: `[D, 2, 2]`, px.
+        pixels: centres, `[D, 2]`, px.
+        shapes: shapes, `[D, 2, 2]`, px.
         image_size: width, height.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Dots fitted to sub-pixel accuracy: a blurred ellipse on sloping background."""
+"""Fit of dots to sub-pixel accuracy: a blurred ellipse on a sloping background."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ SLOPE, GROWTH = 100.0, 0.3  # ridges of the fit: of the background's slope over 
 
 
 class Outline(NamedTuple):
-    """The model's dot on the pixels of a window, each `[..., P]`; lengths over the softness of its outline."""
+    """The model of a dot at the pixels of a window, each `[..., P]`; lengths are relative to the softness of its outline."""
 
     depth: Tensor  # of the pixel inside the outline
     template: Tensor  # 1 inside, 0 outside
@@ -30,15 +30,15 @@ class Outline(NamedTuple):
 
 
 class FittedDots(NamedTuple):
-    """Of a batch.
+    """Fitted dots of a batch.
 
     Attributes:
-        centre: `[B, D, 2]`, px.
-        covariance: of the centre `[B, D, 2, 2]`, px^2.
-        growth: of the outline `[B, D]`, px.
-        explained: share of the window's variance, `[B, D]`, at most 1.
-        contrast: over the background `[B, D]`.
-        misfit: of the size, squared standard deviations `[B, D]`.
+        centre: centres, `[B, D, 2]`, px.
+        covariance: covariance of the centres, `[B, D, 2, 2]`, px^2.
+        growth: growth of the outline, `[B, D]`, px.
+        explained: share of the window's variance that the model explains, `[B, D]`, at most 1.
+        contrast: contrast with the background, `[B, D]`.
+        misfit: misfit of the size, `[B, D]`, squared standard deviations.
     """
 
     centre: Tensor
@@ -50,20 +50,20 @@ class FittedDots(NamedTuple):
 
 
 class EllipseFit(nn.Module):
-    """Least-squares fit of a blurred ellipse on sloping background, `I = b_0 + b . y - a T(x - c)`, to every dot.
+    """Least-squares fit of a blurred ellipse on a sloping background, `I = b_0 + b . y - a T(x - c)`, to every dot.
 
-    Gauss-Newton steps on windows of the level of the pyramid that suits the dot's size. What is dark outside the outline, a
-    neighbour or the world beyond the rim, loses its weight. Offsets of pixels are in pixels of that level; place, size and
-    growth of a dot are over the softness of its outline.
+    It takes Gauss-Newton steps on windows of the pyramid level that suits the dot's size. Dark pixels outside the outline, such
+    as a neighbour or objects beyond the rim, lose their weight. Pixel offsets are in pixels of that level; position, size and
+    growth of a dot are relative to the softness of its outline.
 
     Args:
-        pixels: centres `[D, 2]` in the rest image, px.
-        shapes: `[D, 2, 2]` in the rest image, px.
+        pixels: centres in the rest image, `[D, 2]`, px.
+        shapes: shapes in the rest image, `[D, 2, 2]`, px.
         image_size: width, height.
         size_tolerance: standard deviation of a dot's log radius.
 
     Limitations:
-        The centre moves by no more than the dot's half axis and a pixel from where the fit begins.
+        The centre moves by at most the dot's half axis plus one pixel from its start.
     """
 
     dot_to_row: Tensor
@@ -115,7 +115,7 @@ class EllipseFit(nn.Module):
         self.register_buffer("farthest", torch.tensor([2.0, 2.0, 1.0])[:, None, None])
 
     def _register_levels(self, level: np.ndarray, offset: np.ndarray, sizes: np.ndarray) -> None:
-        """Which dots are fitted on which level, and where in it the pixels of a window are."""
+        """Register on which level each dot is fitted, and the positions of the pixels of its window on that level."""
         self.levels = [int(k) for k in np.unique(level)]
         dots = [np.flatnonzero(level == k) for k in self.levels]
         self.register_buffer("dot_to_row", torch.as_tensor(np.argsort(np.concatenate(dots))))
@@ -127,7 +127,8 @@ class EllipseFit(nn.Module):
         self.register_buffer("linear", torch.as_tensor(np.stack([np.ones_like(u), u, v])))
 
     def windows(self, levels: list[Tensor], centre: Tensor) -> tuple[Tensor, Tensor]:
-        """Values `[B, D, P]` of the pixels of a disc about `centre [B, D, 2]`, and the disc's middle `[B, D, 2]` px.
+        """Return the values `[B, D, P]` of the pixels of a disc around `centre [B, D, 2]`, and the middle of the disc `[B, D,
+        2]` px.
 
         Near the image's border the disc stops where its last pixel meets the border.
         """
@@ -144,14 +145,14 @@ class EllipseFit(nn.Module):
         """Fit every dot of a batch of frames.
 
         Args:
-            levels: of `mean_pyramid`, dark dots.
-            centre: `[B, D, 2]` to begin with, px.
-            shape: `[B, D, 2, 2]`, px.
-            noise: `[B]`, standard deviation of a pixel of the finest level.
-            steps: Gauss-Newton steps.
+            levels: levels of `mean_pyramid`, with dark dots.
+            centre: initial centres, `[B, D, 2]`, px.
+            shape: initial shapes, `[B, D, 2, 2]`, px.
+            noise: standard deviation of a pixel of the finest level, `[B]`.
+            steps: number of Gauss-Newton steps.
 
         Returns:
-            The dots; the misfit of their size is that against `shape` or at rest, the less of them.
+            The dots; the misfit of their size is the smaller of those relative to `shape` and to the shape at rest.
         """
         centre, shape, noise = (value.to(self.size) for value in (centre, shape, noise))
         if self.size.dtype == torch.float32 and takes(*levels, centre, shape, noise):
@@ -189,8 +190,8 @@ class EllipseFit(nn.Module):
         return FittedDots(centre + moved[..., :2], covariance, moved[..., 2], explained, contrast, misfit * self.narrowness)
 
     def _to_circle(self, shape: Tensor) -> tuple[Tensor, Tensor]:
-        """What takes an offset, and one in pixels of the level, to the unit circle and to the outline's normal, `[4, 4, B, D]`;
-        and the dot's size `[B, D]`."""
+        """Return the matrices `[4, 4, B, D]` that map an offset, and one in pixels of the level, to the unit circle and to the
+        outline's normal, and the dot's size `[B, D]`."""
         entries = shape.flatten(-2) * self.unit
         a, b, c, d = entries.unbind(-1)
         inverse = torch.stack([d, -b, -c, a]).unflatten(0, (2, 2)) / (a * d - b * c)
@@ -199,7 +200,8 @@ class EllipseFit(nn.Module):
         return torch.cat([both, both * self.sharpness], 1), (0.5 * entries.square().sum(-1)).sqrt()
 
     def _outline(self, offset: Tensor, growth: Tensor, to_circle: Tensor) -> Outline:
-        """The model's dot on the pixels of the window, its middle at `offset [2, B, D]` from the centre."""
+        """Return the model of the dot at the window's pixels, with the middle of the window at `offset [2, B, D]` from the
+        centre."""
         at_middle, to_circle = (to_circle[:, :2] * offset).sum(1, keepdim=True), to_circle[:, 2:]
         rows = (torch.cat([at_middle, to_circle], 1).movedim(1, -1) @ self.linear).unflatten(0, (2, 2))
         u, v = rows.unbind(1)
@@ -209,8 +211,8 @@ class EllipseFit(nn.Module):
         return Outline(depth, template, template.addcmul(template, template, value=-1), normal, length)
 
     def _intrusion(self, fit: Tensor, gain: Tensor, template: Tensor, window: Tensor) -> Tensor:
-        """By what `[B, D, P]` the weight of a pixel is divided that is darker than the fit before and outside the outline: by 2
-        where it is darker by `FAINT` times the dot's amplitude."""
+        """Return the divisors `[B, D, P]` of the weights of pixels that are darker than the previous fit and outside the
+        outline: 2 if darker by `FAINT` times the dot's amplitude."""
         gain = gain / -FAINT
         scaled = (fit[:4] * gain).movedim(0, -1)
         darker = (scaled[..., :3] @ self.linear).addcmul(scaled[..., 3:], template)
@@ -218,7 +220,7 @@ class EllipseFit(nn.Module):
         return 1 + square.square() * (1 - template)
 
     def _gram(self, outline: Outline, window: Tensor, weight: Tensor) -> Tensor:
-        """Weighted products `[B, D, 8, 8]` of 1, u, v, the template, its derivatives, and last the window itself."""
+        """Return the weighted products `[B, D, 8, 8]` of 1, u, v, the template, its derivatives, and last the window itself."""
         root = weight.sqrt()[None]
         edge, sides = root * outline.edge, self.linear[1:, None, None]
         fields = [root, root * sides, root * outline.template, edge / outline.length * outline.normal, edge, root * window]
@@ -226,7 +228,7 @@ class EllipseFit(nn.Module):
         return basis @ basis.mT
 
     def _seen(self, gram: Tensor, fit: Tensor, missed: Tensor, offset: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """The share of the window's variance that the model explains, and the dot's contrast, `[B, D]`."""
+        """Return the share of the window's variance that the model explains, and the dot's contrast, `[B, D]`."""
         spread = gram[..., 7, 7] - gram[..., 0, 7].square() / gram[..., 0, 0].clamp_min(1)
         explained = 1 - missed / (spread.clamp_min(0) + 1e-6)
         background = (fit[1:3] * offset).sum(0)
@@ -234,13 +236,13 @@ class EllipseFit(nn.Module):
 
 
 def _missed(gram: Tensor, fit: Tensor) -> Tensor:
-    """Weighted sum `[B, D]` of the squared residuals of `fit [B, D, 7, 1]`."""
+    """Return the weighted sum `[B, D]` of the squared residuals of `fit [B, D, 7, 1]`."""
     miss = torch.cat([fit, -torch.ones_like(fit[..., :1, :])], -2)
     return ((gram @ miss) * miss).sum((-2, -1)).clamp_min(0)
 
 
 def _disc(half: int) -> np.ndarray:
-    """Integer offsets `[2, P]` within `half` of 0."""
+    """Return the integer offsets `[2, P]` within the distance `half` of 0."""
     step = np.arange(-half, half + 1)
     offset = np.stack(np.meshgrid(step, step)).reshape(2, -1)
     return np.asarray(offset[:, np.hypot(*offset) <= half + 0.5])

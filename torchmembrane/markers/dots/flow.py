@@ -1,4 +1,4 @@
-"""The flow at every dot as the dots around it have it."""
+"""The flow at every dot, predicted from the surrounding dots."""
 
 import numpy as np
 import torch
@@ -12,14 +12,14 @@ SUPPORT = 0.5  # sure nodes, weighted by distance, that a prediction needs
 
 
 class FlowAverages(nn.Module):
-    """Moving averages of the flow around every dot, over its neighbours, itself left out.
+    """Moving averages of the flow around every dot, over its neighbours without the dot itself.
 
-    Weights `w_n exp(-|x_n - x_d|^2 / 2 h_d^2)`, `h_d` the local pitch. The last nodes, the anchors, have no
-    flow and weight 1. Dots are the last axis throughout: weight `[B, D]`, flow `[B, 2, D]`, gradient `[B, 2, 2, D]`.
+    The weights are `w_n exp(-|x_n - x_d|^2 / 2 h_d^2)`, with the local pitch `h_d`. The last nodes, the anchors, have no flow
+    and weight 1. Dots are the last axis throughout: weight `[B, D]`, flow `[B, 2, D]`, gradient `[B, 2, 2, D]`.
 
     Args:
-        pixels: centres `[D, 2]` of the dots at rest, px.
-        nodes: `[N, 2]`, the dots and after them the anchors, px.
+        pixels: centres of the dots at rest, `[D, 2]`, px.
+        nodes: the dots followed by the anchors, `[N, 2]`, px.
     """
 
     moments: Tensor
@@ -49,7 +49,8 @@ class FlowAverages(nn.Module):
         self.register_buffer("h", torch.as_tensor(h))
 
     def gradient(self, weight: Tensor, flow: Tensor, prior: Tensor) -> Tensor:
-        """Gradient `[B, 2, 2, D]` of the least-squares affine flow, drawn to `prior` where neighbours do not fix it."""
+        """Return the gradient `[B, 2, 2, D]` of the least-squares affine flow; it tends to `prior` where the neighbours do not
+        determine it."""
         if is_native(weight, flow, prior, self.h):
             return found_by(gradients, self._constants(), (weight, flow, prior), 2, 2, len(self.h))
         weight = weight[:, None]
@@ -65,13 +66,13 @@ class FlowAverages(nn.Module):
         return solved / determinant[:, None, None]
 
     def along(self, weight: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """The flow predicted from the neighbours' flow and gradient.
+        """Predict the flow from the neighbours' flow and gradient.
 
-        `f_d = mean_n f_n + (J_n + J_d) / 2 (x_d - x_n)` where the gradient is known at the dots; anchors take the gradient
-        of the dot.
+        `f_d = mean_n f_n + (J_n + J_d) / 2 (x_d - x_n)` if the gradient is known at the dots; for anchors the gradient at the
+        dot is used.
 
         Returns:
-            Flow `[B, 2, D]` and support `[B, D]`: the sure nodes around, weighted by distance.
+            Flow `[B, 2, D]` and support `[B, D]`: the sum of the confident nodes around, weighted by distance.
         """
         if is_native(weight, flow, gradient, self.h):
             found = found_by(flows, self._constants(), (weight, flow, gradient), 3, len(self.h))

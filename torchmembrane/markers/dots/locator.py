@@ -1,4 +1,4 @@
-"""Locating dots in a batch of frames: blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
+"""Location of dots in a batch of frames: blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
 
 import numpy as np
 import torch
@@ -63,9 +63,9 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
 
 
 def is_inside(pixels: Tensor, image: Tensor) -> Tensor:
-    """Which of `pixels [..., 2]` lie in an image `[..., height, width]`, bool.
+    """Return which of `pixels [..., 2]` lie in an image `[..., height, width]`, bool.
 
-    A dot that its neighbours expect outside is not seen; what a fit finds at the border in its place is something else.
+    A dot that its neighbours expect outside the image is not visible; a fit at the border in its place is something else.
 
     Example:
         >>> is_inside(torch.tensor([[0.0, 0.0], [3.0, 1.0], [3.0, 2.0], [-1.0, 0.0]]), torch.zeros(2, 4)).tolist()
@@ -86,7 +86,7 @@ def short(image: Tensor) -> Tensor:
 
 
 def rounded(value: Tensor, step: float) -> Tensor:
-    """The nearest multiple of a step; gradients as if it were the value.
+    """Round to the nearest multiple of a step; gradients are those of the unrounded value.
 
     Example:
         >>> rounded(torch.tensor([0.3, 7.0]), 0.125).tolist()
@@ -172,7 +172,7 @@ class DotLocator(nn.Module):
 
     @property
     def is_compiled(self) -> bool:
-        """Whether there is machine code of the fit and the matching's steps already."""
+        """Whether machine code of the fit and of the matching steps exists already."""
         return all(each.is_compiled(np.dtype(np.float32)) for each in (kept_fits, *KEPT_STEPS.values()))
 
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
@@ -189,7 +189,8 @@ class DotLocator(nn.Module):
 
     @traced
     def begin(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The levels of the pyramid, and the blobs: centres `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
+        """Return the levels of the pyramid, and the blobs: centres `[B, K, 2]`, log radii `[B, K]`, and the probability that
+        each is a dot."""
         image = 1 - image if self.polarity == "light" else image
         levels = mean_pyramid(short(image) if self.is_exact else image)
         blobs, log_radius, strength = self.detect(levels)
@@ -213,7 +214,7 @@ class DotLocator(nn.Module):
         certainty: Tensor,
         strain: Tensor,
     ) -> LocatedMarkers:
-        """The dots, by the fit about where the matcher places the dots."""
+        """Return the dots, fitted around the positions from the matcher."""
         levels, rest, shapes = [level_0, level_1, level_2], self.rest, self.shapes
         gradient = self._alike(self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), SHARE)
         shape = shapes + gradient.clamp(-LARGEST_STRAIN, LARGEST_STRAIN).to(shapes) @ shapes

@@ -1,4 +1,4 @@
-"""Matching: which blob of the frame is which dot, by a flow that is smooth."""
+"""Matching: assigns the blobs of a frame to dots, assuming a smooth flow."""
 
 from collections.abc import Sequence
 
@@ -74,30 +74,31 @@ class DotMatcher(nn.Module):
         self.register_buffer("numbers", torch.tensor([SUPPORT, LOST, FAR], dtype=torch.float64))
 
     def nearest_dots(self, blobs: Tensor) -> Tensor:
-        """Which dot at rest is nearest to each of `blobs [B, K, 2]`, `[B, K]`."""
+        """Return the dot at rest that is nearest to each of `blobs [B, K, 2]`, `[B, K]`."""
         return F.linear(blobs - self.origin, -2 * self.pixels, self.square).argmin(-1)
 
     def predict(self, weight: Tensor, flow: Tensor, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Flow `[B, D, 2]`, gradient `[B, D, 2, 2]` and support `[B, D]` at the dots, from weight, flow and strain there."""
+        """Return flow `[B, D, 2]`, gradient `[B, D, 2, 2]` and support `[B, D]` at the dots, from weight, flow and strain of
+        the dots."""
         gradient = self.gradient(weight, flow, strain)
         predicted, support = self.averages.along(weight, flow.mT, gradient)
         return predicted.mT, gradient.movedim(-1, 1), support
 
     def gradient(self, weight: Tensor, flow: Tensor, strain: Tensor) -> Tensor:
-        """Gradient `[B, 2, 2, D]` of the flow at the dots, from what `predict` takes."""
+        """Return the gradient `[B, 2, 2, D]` of the flow at the dots, from the arguments of `predict`."""
         return self.averages.gradient(weight, flow.mT, strain.movedim(1, -1))
 
     def choose(self, predicted: Tensor, support: Tensor, blobs: Tensor, base: Tensor) -> State:
-        """Each dot's blob.
+        """Choose a blob for each dot.
 
         Args:
-            predicted: flow `[B, 2, D]`, px.
-            support: of the prediction `[B, D]`.
-            blobs: `[B, 7, K]`: 1, positions and strains.
-            base: `[B, D, K]`: what of the cost does not depend on the prediction.
+            predicted: predicted flow, `[B, 2, D]`, px.
+            support: support of the prediction, `[B, D]`.
+            blobs: 1, positions and strains of the blobs, `[B, 7, K]`.
+            base: the part of the cost that does not depend on the prediction, `[B, D, K]`.
 
         Returns:
-            Certainty `[B, D]`, the flow to the blob `[B, 2, D]` (the prediction where lost), its strain `[B, 2, 2, D]`.
+            Certainty `[B, D]`, the flow to the blob `[B, 2, D]` (the prediction if lost), and its strain `[B, 2, 2, D]`.
         """
         if is_native(predicted, support, blobs, base, self.pixels):
             given = predicted, support, blobs, base
@@ -149,7 +150,7 @@ class DotMatcher(nn.Module):
         return self.end(*cond(complete, (weight, flow, strain), doubted))
 
     def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None) -> State:
-        """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
+        """Return weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots, searched without previous positions."""
         deformation = self.deformation(blobs, valid)
         known, base = self.scene(deformation, blobs, log_radius, valid)
         place, blobs, misfit = self.begin(blobs, log_radius, valid, previous)
@@ -163,8 +164,8 @@ class DotMatcher(nn.Module):
     def begin(
         self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the dots were `[B, D, 2]` and the blobs `[B, K, 2]`, px about the pattern's mean at rest, and the misfit of the
-        blobs' sizes `[B, D, K]`; without gradients."""
+        """Return the previous positions of the dots `[B, D, 2]` and the blobs `[B, K, 2]`, px relative to the pattern's mean at
+        rest, and the misfit of the blobs' sizes `[B, D, K]`; without gradients."""
         flow, found = self.flow_before(previous)
         place, _ = self.expected(self.pixels.expand_as(flow), self.pixels + flow, found.to(flow.dtype))
         misfit = self.misfit(log_radius, valid).detach()
@@ -173,8 +174,11 @@ class DotMatcher(nn.Module):
 
     @traced
     def expected(self, place: Tensor, blob: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the dots are expected `[B, D, 2]` by those around them that are `found [B, D]` on their `blob [B, D, 2]`, from
-        how far these are off the `place [B, D, 2]` where they were expected before; and how many these are `[B, D]`."""
+        """Return the expected positions of the dots `[B, D, 2]`, and the number of found neighbours they are based on `[B, D]`.
+
+        Neighbours that are `found [B, D]` at their `blob [B, D, 2]` contribute their distances from the `place [B, D, 2]` where
+        they were expected before.
+        """
         flow = (found[..., None] * (blob - place)).mT
         gradient = self.averages.gradient(found, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1))
         away, support = self.averages.along(found, flow, gradient)
@@ -182,12 +186,15 @@ class DotMatcher(nn.Module):
 
     @traced
     def chosen(self, place: Tensor, support: Tensor, known: Tensor, base: Tensor) -> State:
-        """The blobs nearest to the `place [B, D, 2]` where dots are expected."""
+        """Return the blobs nearest to the `place [B, D, 2]` where the dots are expected."""
         return self.choose((place - self.pixels).mT, support, known, base)
 
     def flow_before(self, previous: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Flow `[B, D, 2]` of the dots in the frames before, and which were found `[B, D]`; without these or where half were
-        lost, none, and those seen at rest."""
+        """Return the flow `[B, D, 2]` of the dots in the previous frames, and which were found `[B, D]`.
+
+        Without previous frames, or if half of the dots were lost, the flow is zero, and the dots visible at rest count as
+        found.
+        """
         found, flow = self.seen[None], torch.zeros_like(self.pixels[None])
         if previous is None:
             return flow, found
@@ -198,8 +205,8 @@ class DotMatcher(nn.Module):
 
     @traced
     def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `search`, from the frames before, in the scene that is `unstrained`; and in which frames `[B]` all dots that were
-        found could be followed."""
+        """Return the result of `search`, but from the previous frames and in the `unstrained` scene; and in which frames `[B]`
+        all dots that were found could be followed."""
         flow, found = self.flow_before(previous)
         weight, flow = found.to(base.dtype), flow.mT
         state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
@@ -210,62 +217,63 @@ class DotMatcher(nn.Module):
     def sure(
         self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What the dots that are found say, the same to the last digit whether they were followed or searched for; and in which
-        frames `[B]` all are found, so that none can be on another's blob."""
+        """Return the result that follows from the found dots alone, equal to the last digit for followed and searched dots; and
+        in which frames `[B]` all are found, so that none can be at another's blob."""
         complete = ((weight >= FOUND) | ~self.seen).all(-1)
         weight, flow, strain = self.from_sure(weight, flow, strain, known, base)
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
 
     @traced
     def from_sure(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
-        """A step from the dots that are found alone: which they are and where, not how surely."""
+        """Take a step from the found dots alone: it uses which they are and where, not their certainty."""
         found = (weight >= FOUND).to(flow.dtype)
         return self.settle(found, found[:, None] * flow, torch.zeros_like(strain), known, base)
 
     @traced
     def unstrained(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """The `scene` of blobs whose arrangement says nothing."""
+        """Return the `scene` of blobs without measured strain."""
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
         return self.scene(eye[..., None].expand(*valid.shape[:1], 2, 2, valid.shape[1]), blobs, log_radius, valid)
 
     @traced
     def either(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *others: Tensor) -> State:
-        """These dots in the frames `kept [B]`, the others in the others."""
+        """Return these dots in the frames `kept [B]`, and the others in the remaining frames."""
         weight, flow, strain = where_rows(kept, (weight, flow, strain), others)
         return weight, flow, strain
 
     @traced
     def better(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *others: Tensor) -> State:
-        """These dots in the frames `kept [B]` and where the others are not more or surer, the others elsewhere."""
+        """Return these dots in the frames `kept [B]` and where the others are not more or more certain; the others elsewhere."""
         return self.either(kept | (weight.sum(-1) >= others[0].sum(-1)), weight, flow, strain, *others)
 
     @traced
     def scene(self, deformation: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """What `choose` needs to know of the blobs: `[B, 7, K]`, `[B, D, K]`."""
+        """Return the properties of the blobs that `choose` needs: `[B, 7, K]`, `[B, D, K]`."""
         strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         position = (blobs - self.origin).mT
         known = torch.cat([torch.ones_like(position[:, :1]), position, strain.flatten(1, 2)], 1)
         return known, self.misfit(log_radius, valid) + self.stiffness[:, None] * position.square().sum(1, keepdim=True)
 
     def misfit(self, log_radius: Tensor, valid: Tensor) -> Tensor:
-        """How ill the blobs' sizes fit the dots, squared standard deviations `[B, D, K]`; what is no dot fits none."""
+        """Return the misfit of the blobs' sizes to the dots, `[B, D, K]`, squared standard deviations; blobs that are no dots
+        fit none."""
         no_dot = -2 * valid.clamp_min(LEAST).log()
         return ((self.log_radius[:, None] - log_radius[:, None]) / self.size_tolerance).square() + no_dot[:, None]
 
     @traced
     def grow(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
-        """One step outwards along the strain measured."""
+        """Take one step outwards along the measured strain."""
         return self.choose(*self.averages.along(weight, flow, strain), known, base)
 
     @traced
     def settle(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
-        """One step along the strain measured and what the neighbours' flow says of it."""
+        """Take one step along the measured strain and the gradient of the neighbours' flow."""
         gradient = self.averages.gradient(weight, flow, strain)
         return self.choose(*self.averages.along(weight, flow, gradient), known, base)
 
     @traced
     def doubt(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
-        """Some steps more after those that took another's blob have been let go."""
+        """Release the dots that took another's blob, and take some more steps."""
         own = own_evidence(*self.neighbour_steps(self.pixels.mT + flow, weight, strain))
         state = weight * torch.sigmoid(own), flow, strain
         for _ in range(STEPS):
@@ -274,5 +282,5 @@ class DotMatcher(nn.Module):
 
     @traced
     def end(self, weight: Tensor, flow: Tensor, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions, certainty and strain, as `forward` returns them."""
+        """Return positions, certainty and strain in the form of `forward`."""
         return self.pixels + self.origin + flow.mT, weight, strain.movedim(-1, 1)

@@ -1,4 +1,4 @@
-"""Dots in the rest image: found without any prior, or measured where the sensor file says they are."""
+"""Dots in the rest image: found without prior knowledge, or measured at the positions of the sensor file."""
 
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ class DotPattern(NamedTuple):
 
 
 def refine(dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: float = TOLERANCE) -> FittedDots:
-    """Dots fitted to sub-pixel accuracy, a batch of one."""
+    """Fit the dots to sub-pixel accuracy, as a batch of one."""
     fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance)
     levels = mean_pyramid(torch.as_tensor(dark)[None, None])
     found: FittedDots = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1), 8)
@@ -40,7 +40,7 @@ def refine(dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: 
 
 
 def population(pixels: np.ndarray, shapes: np.ndarray, contrasts: np.ndarray) -> np.ndarray:
-    """Which blobs `[N]` belong to the pattern: their size and contrast is near that of the blobs around them."""
+    """Return which blobs `[N]` belong to the pattern: those with size and contrast similar to the surrounding blobs."""
     log_radius = log_radii(shapes)
     keep = np.ones(len(pixels), bool)
     for _ in range(STEPS):
@@ -51,7 +51,8 @@ def population(pixels: np.ndarray, shapes: np.ndarray, contrasts: np.ndarray) ->
 
 
 def size_classes(pixels: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """`[D]` 0 small, 1 large: two clusters of log radius about a common quadratic field of the view, else all 1."""
+    """Return the sizes `[D]`, 0 small, 1 large: two clusters of log radius about a common quadratic function of position;
+    without two clusters all are 1."""
     log_radius = log_radii(shapes)
     x = (pixels - pixels.mean(0)) / pixels.std()
     field = np.stack([np.ones(len(x)), *x.T, x[:, 0] ** 2, x[:, 1] ** 2, x[:, 0] * x[:, 1]], -1)
@@ -164,5 +165,5 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
 
 
 def _dark(image: np.ndarray, polarity: str) -> np.ndarray:
-    """The image, or its negative where the dots are light."""
+    """Return the image, or its negative if the dots are light."""
     return np.asarray(image, float) if polarity == "dark" else 1 - np.asarray(image, float)

@@ -1,7 +1,7 @@
-"""How probably a dot is found where it was fitted.
+"""The probability that a dot is at its fitted position.
 
-What else may be there: nothing; something fainter than this frame's dots; or another's dot. Each has odds against the dot's
-own, and the probability is `1 / (1 + sum of the odds)`.
+The alternatives are: nothing; something fainter than the dots of this frame; or another dot. Each has odds against the dot
+itself, and the probability is `1 / (1 + sum of the odds)`.
 """
 
 import math
@@ -27,9 +27,10 @@ LEAST = 1e-6
 
 
 def dot_evidence(explained: Tensor) -> Tensor:
-    """Log odds of a dot against none from the share of a window's variance that the dot explains.
+    """Return the log odds of a dot against nothing, from the share of a window's variance that the dot explains.
 
-    Schwarz's criterion (1978) of a model with `PARAMETERS` more: `-PIXELS / 2 log(1 - explained) - PARAMETERS / 2 log PIXELS`.
+    They follow Schwarz's criterion (1978) for a model with `PARAMETERS` more parameters: `-PIXELS / 2 log(1 - explained) -
+    PARAMETERS / 2 log PIXELS`.
 
     Example:
         >>> [round(x, 1) for x in dot_evidence(torch.tensor([0.0, 0.6, 0.95])).tolist()]
@@ -51,10 +52,10 @@ def contrast_evidence(contrast: Tensor, middle: float = 0.5) -> Tensor:
 
 
 def own_evidence(found: Tensor, error: Tensor) -> Tensor:
-    """Log odds of a dot being itself against being another's.
+    """Return the log odds of a dot being itself against being another dot.
 
-    The share of the dots around that is `found [B, D]`, in 0..1, is the share of right ones to begin with. The relative error
-    of the steps to them, `error [B, D]`, is normal with `STEP_DEVIATION` of a right one, and up to `PREDICTION` of another.
+    The prior is the share `found [B, D]`, in 0..1, of the surrounding dots. The relative error of the steps to them, `error [B,
+    D]`, is normal with `STEP_DEVIATION` for the right dot, and up to `PREDICTION` for another.
 
     Example:
         >>> [round(x, 1) for x in own_evidence(torch.tensor([1.0, 1.0, 0.5]), torch.tensor([0.0, 0.3, 0.3])).tolist()]
@@ -66,10 +67,10 @@ def own_evidence(found: Tensor, error: Tensor) -> Tensor:
 
 
 def whole_evidence(tear: Tensor) -> Tensor:
-    """Log odds of a pattern that is whole around a dot against one that is torn, by what `Seams` measures `[B, D]`.
+    """Return the log odds of an intact pattern around a dot against a torn one, from the measure `[B, D]` of `Seams`.
 
-    Of a whole one this is distributed exponentially with mean `TEAR`; of a torn one it may be anything in 0..1. The odds of a
-    torn one to begin with are `LOST`.
+    For an intact pattern the measure has an exponential distribution with mean `TEAR`; for a torn one it is uniform in 0..1.
+    The prior odds of a torn one are `LOST`.
 
     Example:
         >>> [round(x, 1) for x in whole_evidence(torch.tensor([0.0, 0.038, 0.08])).tolist()]
@@ -79,7 +80,7 @@ def whole_evidence(tear: Tensor) -> Tensor:
 
 
 def probability(*evidence: Tensor) -> Tensor:
-    """Of what has this evidence against each other explanation, log odds `[B, D]`.
+    """Return the probability of a dot from its evidence against each alternative, log odds `[B, D]`.
 
     Example:
         >>> round(float(probability(torch.tensor(3.0), torch.tensor(2.0))), 3)
@@ -89,25 +90,25 @@ def probability(*evidence: Tensor) -> Tensor:
 
 
 def alone(dots: FittedDots) -> Tensor:
-    """How probably each dot is where it was fitted, from its own window, `[B, D]` in 0..1."""
+    """Return the probability that each dot is at its fitted position, from its own window, `[B, D]` in 0..1."""
     one = torch.ones_like(dots.misfit)
     return probability(*_there(dots), own_evidence(one, 0 * one) - 0.5 * dots.misfit)
 
 
 def among_neighbours(dots: FittedDots, found: Tensor, error: Tensor, *others: Tensor) -> Tensor:
-    """How probably each dot is where it was fitted, `[B, D]` in 0..1.
+    """Return the probability that each dot is at its fitted position, from its window and its neighbours, `[B, D]` in 0..1.
 
     Args:
-        dots: as fitted.
-        found: share of the dots that is found around each `[B, D]`, in 0..1.
-        error: relative, of the steps to these `[B, D]`.
-        others: evidence against further explanations, log odds `[B, D]`.
+        dots: fitted dots.
+        found: share of the surrounding dots that is found, `[B, D]`, in 0..1.
+        error: relative error of the steps to them, `[B, D]`.
+        others: evidence against further alternatives, log odds `[B, D]`.
     """
     return probability(*_there(dots), own_evidence(found, error) - 0.5 * dots.misfit, *others)
 
 
 def _there(dots: FittedDots) -> tuple[Tensor, Tensor]:
-    """Evidence of a dot against nothing and against something fainter."""
+    """Return the evidence of a dot against nothing and against something fainter."""
     clearer = dots.contrast.topk(dots.contrast.shape[1] // 2, -1).values
     level = clearer.mean(-1, keepdim=True).clamp_min(0) + SHADE
     return dot_evidence(dots.explained), contrast_evidence(dots.contrast / level)

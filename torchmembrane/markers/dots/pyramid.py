@@ -1,4 +1,4 @@
-"""Images of the dots with their resolution halved twice: means, so that a pixel covers those it replaces."""
+"""Images with their resolution halved twice, by averages, so that a pixel covers those that it replaces."""
 
 import torch
 import torch.nn.functional as F
@@ -8,7 +8,7 @@ LEVELS = 3
 
 
 def mean_pyramid(image: Tensor) -> list[Tensor]:
-    """The image and its means over 2 x 2 and 4 x 4 pixels.
+    """Return the image and its means over 2 x 2 and 4 x 4 pixels.
 
     Pixel `p` of level `k` is centred at `2^k p + (2^k - 1) / 2` of the image.
 
@@ -29,7 +29,7 @@ def mean_pyramid(image: Tensor) -> list[Tensor]:
 
 
 def _halved(image: Tensor) -> Tensor:
-    """`F.avg_pool2d(image, 2)`; on a processor sums of slices take a sixth of its time, but not in exported models."""
+    """Return `F.avg_pool2d(image, 2)`; on a processor, sums of slices take a sixth of its time, but not in exported models."""
     if torch.compiler.is_exporting():
         return F.avg_pool2d(image, 2)
     height, width = (side // 2 * 2 for side in image.shape[-2:])

@@ -1,4 +1,4 @@
-"""Seams: where a region of the pattern is matched a whole pitch off."""
+"""Seams of the matching: borders of regions that are matched one pitch off."""
 
 import numpy as np
 import torch
@@ -11,15 +11,15 @@ LEAST = 1e-3
 
 
 class Seams(nn.Module):
-    """How torn the pattern is around every dot.
+    """Measures how torn the matched pattern is around every dot.
 
-    A region matched one pitch off ends in a seam, where dots are lost, blobs of their size are left over, and the step
-    from a dot to its neighbour is not what the deformation measured at both makes of it at rest. Lost dots or blobs left
-    over alone, or a field that varies fast, are no seam.
+    A region matched one pitch off ends in a seam. There dots are lost, blobs of their size are left over, and the step from a
+    dot to its neighbour differs from the step at rest under the deformation measured at both. Lost dots or left-over blobs
+    alone, or a flow that varies fast, are not a seam.
 
     Args:
-        pixels: centres `[D, 2]` of the dots at rest, px.
-        log_radius: `[D]`, as the blob detector finds it at rest.
+        pixels: centres of the dots at rest, `[D, 2]`, px.
+        log_radius: log radii from the blob detector at rest, `[D]`.
         size_tolerance: standard deviation of a dot's log radius.
     """
 
@@ -43,13 +43,15 @@ class Seams(nn.Module):
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
 
     def forward(self, pixels: Tensor, sure: Tensor, wrong: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> Tensor:
-        """Root of the share of dots lost and blobs left over, times the relative error of steps, `[B, D]`.
+        """Return the root of the share of lost dots and left-over blobs, times the relative error of steps, `[B, D]`.
 
         Args:
-            pixels: of the dots as found `[B, D, 2]`, px.
-            sure: how surely, `[B, D]` in 0..1.
-            wrong: relative error of the steps to their neighbours `[B, D]`.
-            blobs: `[B, K, 2]`, px; log_radius, valid: `[B, K]`, as for `DotMatcher`.
+            pixels: positions of the found dots, `[B, D, 2]`, px.
+            sure: certainty of the dots, `[B, D]` in 0..1.
+            wrong: relative error of the steps to their neighbours, `[B, D]`.
+            blobs: positions of the blobs, `[B, K, 2]`, px.
+            log_radius: log radii of the blobs, `[B, K]`, as for `DotMatcher`.
+            valid: probability that each blob is a dot, `[B, K]`, as for `DotMatcher`.
         """
         square = square_distance(blobs - self.origin, pixels - self.origin)  # [B, K, D]
         claimed = ((square < self.claim) * sure[:, None]).amax(-1)

@@ -1,4 +1,4 @@
-"""Steps from every dot to its neighbours: whether they are what the deformation measured makes of those at rest."""
+"""Comparison of the steps from every dot to its neighbours with the steps at rest under the measured deformation."""
 
 import numpy as np
 import torch
@@ -13,8 +13,8 @@ class NeighbourSteps(nn.Module):
     """The steps of a pattern. Dots are the last axis throughout.
 
     Args:
-        pixels: centres `[D, 2]` of the dots at rest, px.
-        seen: `[D]` bool, which of them are in the image at rest: no other can be lost.
+        pixels: centres of the dots at rest, `[D, 2]`, px.
+        seen: which of them are in the image at rest, `[D]` bool; only these can be lost.
     """
 
     near: Tensor
@@ -34,16 +34,16 @@ class NeighbourSteps(nn.Module):
         self.register_buffer("length", torch.as_tensor(np.linalg.norm(step, axis=0)))
 
     def forward(self, pixels: Tensor, sure: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """How many neighbours there are, and how wrong the steps to them.
+        """Return the share of found neighbours, and the error of the steps to them.
 
         Args:
-            pixels: of the dots `[B, 2, D]`, px.
-            sure: how sure they are `[B, D]`, in 0..1.
-            gradient: of the flow `[B, 2, 2, D]`.
+            pixels: positions of the dots, `[B, 2, D]`, px.
+            sure: certainty of the dots, `[B, D]`, in 0..1.
+            gradient: gradient of the flow, `[B, 2, 2, D]`.
 
         Returns:
-            The share of the neighbours seen at rest that is sure, and the mean relative error of the steps between sure dots,
-            `[B, D]` each.
+            The share of the neighbours visible at rest that is certain, and the mean relative error of the steps between
+            certain dots, `[B, D]` each.
         """
         here = torch.cat([gradient.flatten(1, 2), pixels, sure[:, None]], 1)
         there = here.index_select(2, self.near.flatten()).unflatten(-1, self.near.shape)  # [B, 7, neighbours, D]
