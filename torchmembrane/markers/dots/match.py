@@ -150,7 +150,7 @@ class DotMatcher(nn.Module):
         return self.end(*cond(complete, (weight, flow, strain), doubted))
 
     def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None) -> State:
-        """Search for all dots, also from their previous pixels; return weight `[B, D]`, flow `[B, 2, D]`, strain `[B, 2, 2, D]`."""
+        """Search for all dots, also near previous pixels; return weight `[B, D]`, flow `[B, 2, D]`, strain `[B, 2, 2, D]`."""
         deformation = self.deformation(blobs, valid)
         known, base = self.scene(deformation, blobs, log_radius, valid)
         place, blobs, misfit = self.begin(blobs, log_radius, valid, previous)
@@ -243,7 +243,7 @@ class DotMatcher(nn.Module):
 
     @traced
     def better(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *others: Tensor) -> State:
-        """Return these dots in the frames `kept [B]` and where their total certainty is no less than the others'; else the others."""
+        """Return these dots in the frames `kept [B]` and where their total certainty is at least that of the others."""
         return self.either(kept | (weight.sum(-1) >= others[0].sum(-1)), weight, flow, strain, *others)
 
     @traced
