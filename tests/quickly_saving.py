@@ -1,4 +1,4 @@
-"""A command that saves each result at once, to be run in a process of its own."""
+"""A command that saves each result at once, for a process of its own."""
 
 import os
 import sys

@@ -193,7 +193,7 @@ def _overlays(expected: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
     for *step, turn in product(STEPS, STEPS, TURNS):
         c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
         over = np.median(found, 0) + pitch * np.array(step) + grown * (expected - middle) @ np.array([[c, s], [-s, c]])
-        before = None
+        before = np.zeros(0)
         for _ in range(ROUNDS):
             partner = _partners(over, found, tree)
             near = partner >= 0
@@ -219,7 +219,7 @@ def _settled(
     where they are in the image."""
     tree, motion, score = cKDTree(pattern.pixels), np.zeros(6), 0.0
     both = len(np.unique(sizes)) == 2 == len(np.unique(pattern.sizes))
-    before = None
+    before = np.zeros(0)
     for _ in range(ROUNDS):
         partner = _partners(expected, pattern.pixels, tree)
         near = partner >= 0
