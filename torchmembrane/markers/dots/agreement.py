@@ -11,8 +11,8 @@ from ...control_flow import fori_loop, traced
 from ..spacing import spacing, square_distance
 from .scales import CANDIDATES, FAR, LOST, PREDICTION, REACH
 
-DOUBT = -log(LOST)  # what a lost dot costs, and a wrong step or size at most
-EXCHANGES = 20  # of messages between all neighbours
+DOUBT = -log(LOST)  # cost of a lost dot, and largest cost of a wrong step or size
+EXCHANGES = 20  # number of exchanges of messages between all neighbours
 
 
 def edges(pixels: np.ndarray) -> np.ndarray:

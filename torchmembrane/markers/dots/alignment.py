@@ -11,7 +11,7 @@ from ..spacing import spacing, square_distance
 from .probability import LEAST
 from .scales import CANDIDATES, NONE, REACH, STEPS
 
-VOTE = 0.4  # pitches: width of a vote, distance of the shifts, and about where the affine map looks for blobs
+VOTE = 0.4  # pitches: width of a vote, spacing of the shifts, and initial search radius of the affine map
 
 
 class Alignment(nn.Module):

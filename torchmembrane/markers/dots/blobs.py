@@ -8,12 +8,12 @@ from scipy import fft, ndimage
 from ...errors import MembraneError
 
 SCALES = 1.25  # ratio of neighbouring scales
-SMALLEST = 1.2  # px, radius of the smallest dot looked for
-LARGEST = 1 / 16  # radius of the largest, of the image's shorter side
-ELONGATION = 4.0  # long over short axis of a dot at most
+SMALLEST = 1.2  # px, radius of the smallest dot
+LARGEST = 1 / 16  # radius of the largest dot, relative to the image's shorter side
+ELONGATION = 4.0  # largest ratio of a dot's long and short axes
 FEWEST = 6
-LONG_FILTER = 2.0  # px, standard deviation of Gaussians from which on cosine series are both exact and faster
-SOLIDITY = 0.75  # of its ellipse that a dot fills, or a dot that its ellipse fills
+LONG_FILTER = 2.0  # px, standard deviation of a Gaussian above which cosine series are exact and faster
+SOLIDITY = 0.75  # smallest ratio of the areas of a dot and its ellipse, either way
 
 
 class Blob(NamedTuple):

@@ -8,9 +8,9 @@ from ...control_flow import fori_loop, traced
 from ..spacing import FADED, neighbours, spacing, square_distance
 from .scales import CANDIDATES, FAR, NEIGHBOURS, NONE, RIDGE
 
-WIDTH = 0.2  # pitches, within which a neighbour's blob lies from where a deformation puts it
-AVERAGE = 0.8  # pitches, over which a deformation is averaged
-FITS = 6  # of a deformation to the blobs around
+WIDTH = 0.2  # pitches, distance of a neighbour's blob from its position under a deformation
+AVERAGE = 0.8  # pitches, radius of the averages of deformations
+FITS = 6  # number of fits of a deformation to the surrounding blobs
 
 
 def monomial_map() -> Tensor:

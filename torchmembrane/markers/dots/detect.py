@@ -11,8 +11,8 @@ from .bands import BandProduct, SeparableMap, blur_rows, linear_rows, pair_means
 from .pyramid import LEVELS
 from .scales import PREDICTION, SHADE
 
-FINEST_SIGMA = 0.9  # of the blob detector on a level of the pyramid, pixels of the level
-SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
+FINEST_SIGMA = 0.9  # smallest sigma of the blob detector on a pyramid level, pixels of the level
+SCALE_STEP = 1.6  # largest ratio of neighbouring scales of the blob detector
 
 Span = tuple[int, int]
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
 TOLERANCE = 0.45
-"""Standard deviation of a dot's log radius; of dots of two sizes, over the difference of these where that is below 1."""
+"""Standard deviation of a dot's log radius; for two sizes that differ by less than 1, relative to their difference."""
 
 
 def half_axes(shapes: np.ndarray) -> np.ndarray:

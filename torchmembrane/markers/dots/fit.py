@@ -14,9 +14,9 @@ from .native_fit import MISFIT, NativeFit
 from .pyramid import LEVELS
 from .scales import FAINT
 
-RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
-FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
-SLOPE, GROWTH = 100.0, 0.3  # ridges of the fit: of the background's slope over the dot, and of the dot's growth
+RING = 2.5  # largest width of the ring of background around a dot, pixels of its level
+FINEST = 2.0  # smallest short half axis of a dot on its pyramid level, if there is such a level, pixels
+SLOPE, GROWTH = 100.0, 0.3  # ridges of the fit, for the slope of the background and the growth of the dot
 
 
 class Outline(NamedTuple):

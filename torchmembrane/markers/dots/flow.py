@@ -8,7 +8,7 @@ from ..spacing import faded, spacing
 from .native_flow import flows, found_by, gradients, is_native
 from .scales import RIDGE
 
-SUPPORT = 0.5  # sure nodes, weighted by distance, that a prediction needs
+SUPPORT = 0.5  # smallest number of confident nodes, weighted by distance, for a prediction
 
 
 class FlowAverages(nn.Module):

@@ -23,12 +23,12 @@ from .pyramid import mean_pyramid
 from .scales import FAINT, REACH, STEPS
 from .seams import Seams
 
-DIGITS = 8.0  # float32 has 20 binary ones after the point beside it
+DIGITS = 8.0  # added to a value in 0..1, it leaves float32 with 20 binary digits after the point
 BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
-"""Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
-what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
-LARGEST_STRAIN = 0.5  # of the outlines from which the fit starts
-SPARE = 1.3  # blobs that are wanted for each dot
+"""Steps to which the blobs' centres (px), shares of one, the noise (grey) and the confidence are rounded. The start of the fit is
+not known more finely, and after rounding it is the same in every runtime."""
+LARGEST_STRAIN = 0.5  # largest strain of the outlines from which the fit starts
+SPARE = 1.3  # number of blobs searched per dot
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:

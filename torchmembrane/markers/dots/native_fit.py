@@ -16,13 +16,13 @@ from ...machine_code import Kept, compiled, fingerprint, kept
 from .scales import FAINT
 
 MISFIT = 0.02
-"""Of the residual's variance, what differs from image to image besides noise: most of it is the model's, in all."""
+"""Share of the residual's variance that differs between images besides noise; most of the rest is the model's error."""
 
 LANES, FIELDS, UNKNOWNS = 16, 8, 7
 """Pixels of a block; fields of a pixel, the last the window itself; unknowns of a fit."""
 HALF, ONE, TINY = np.float32(0.5), np.float32(1), np.float32(1e-12)
 LARGEST = np.float32(7.90531110763549805)
-"""Beyond it tanh is 1."""
+"""Above this value tanh is 1."""
 TOP = (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08, 1.48572235717979e-05)
 ODD = tuple(np.float32(c) for c in (*TOP, 6.37261928875436e-04, 4.89352455891786e-03))
 EVEN = tuple(np.float32(c) for c in (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03))

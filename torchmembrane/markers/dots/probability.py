@@ -13,15 +13,15 @@ from .fit import FittedDots
 from .scales import LOST, PREDICTION, SHADE
 
 PIXELS = 10.0
-"""Pixels of a window that each say something of their own: what a fit leaves over comes in clumps, unlike noise."""
+"""Effective number of independent pixels of a window: residuals of a fit are correlated, unlike noise."""
 PARAMETERS = 4.0
-"""Of a dot, beyond its background: contrast, place and size."""
+"""Number of parameters of a dot besides its background: contrast, position and size."""
 CONTRAST_DEVIATION = 0.22
-"""Standard deviation of the contrasts of dots, and of what is none, over that of the clearer dots."""
+"""Standard deviation of the contrasts of dots, and of other objects, relative to the contrast of the clearer dots."""
 STEP_DEVIATION = 0.12
-"""Standard deviation of the steps between neighbours that are found, over their lengths."""
+"""Standard deviation of the steps between found neighbours, relative to their lengths."""
 TEAR = 0.004
-"""Of a whole pattern, the mean of what `Seams` measures."""
+"""Mean of the measure of `Seams` for an intact pattern."""
 LEAST = 1e-6
 """Keeps logarithms finite."""
 

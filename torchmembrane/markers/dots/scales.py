@@ -1,27 +1,27 @@
-"""What the search for dots measures by: how far they move in pitches, how well neighbours predict them, what is too faint."""
+"""Scales of the search for dots: how far they move (in pitches), how well neighbours predict them, and what is too faint."""
 
 import math
 
 STEPS = 3
-"""Of the search's refinements, and of the fit."""
+"""Number of iterations of the refinements in the search, and of the fit."""
 REACH = 2.5
-"""Of a dot from where it is expected, and of an edge between neighbours."""
+"""Largest distance of a dot from its expected position, and of two neighbours, pitches."""
 PREDICTION = 0.3
-"""Standard deviation of where neighbours predict a dot, and of a step between them over its length."""
+"""Standard deviation of a position predicted by neighbours, in pitches, and of a step between them, relative to its length."""
 NEIGHBOURS = 8
-"""Of a dot, whose arrangement, sizes and contrasts are compared: all that surround it in a square pattern."""
+"""Number of neighbours whose arrangement, sizes and contrasts are compared: those around a dot in a square pattern."""
 CANDIDATES = int(math.pi * REACH**2)
-"""Blobs among which a dot chooses, and for whose shifts it votes: as many as lie within `REACH`."""
+"""Number of blobs among which a dot chooses, and for whose shifts it votes: the number within `REACH`."""
 FAINT = 0.35
-"""Strength of a blob, over that of the frame's clearer ones, that is as likely a dot as none; over the dots' contrast, that of
-what stands out."""
+"""Strength of a blob, relative to the clearer blobs of the frame, at which it is as likely a dot as not; also the contrast,
+relative to the dots, of a pixel that stands out."""
 SHADE = 0.05
-"""Contrast of dirt and shade in any frame."""
+"""Contrast of dirt and shadows in any frame."""
 LOST = 0.02
-"""Share of dots lost where none is known to be."""
+"""Prior probability that a dot is lost."""
 RIDGE = 0.5
-"""Draws a gradient to the one before, where neighbours do not fix it."""
+"""Ridge that pulls a gradient towards the previous one where the neighbours do not determine it."""
 NONE = 0.1
-"""Weight of no blob, where dots are laid on blobs softly, beside that of a blob right there."""
+"""Weight of having no blob in soft assignments, relative to that of a blob at the expected position."""
 FAR = 1e6
-"""Cost of what is out of the question."""
+"""Cost of impossible choices."""

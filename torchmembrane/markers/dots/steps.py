@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from ..spacing import neighbours, safe_length
 
-NEIGHBOURS = 6  # nearest, to which a dot's steps are compared with those at rest
+NEIGHBOURS = 6  # number of nearest neighbours, to which the steps from a dot are compared with those at rest
 
 
 class NeighbourSteps(nn.Module):
