@@ -65,12 +65,12 @@ def imaged_vertices(sensor: Sensor, vertex_pixels: Tensor, whole: bool) -> Tenso
         whole: whether the estimator requires all vertices.
 
     Raises:
-        MembraneError: a required vertex cannot be imaged.
+        MembraneError: a required vertex cannot be projected.
     """
     imaged = torch.isfinite(vertex_pixels).all(-1)
     if not (imaged.all() if whole or sensor.markers.positions is None else imaged.any()):
         raise MembraneError(
-            f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses (force "
+            f"sensor {sensor.name!r}: parts of the rest surface cannot be projected by its camera; check the poses (force "
             "balance of listed dots can do with a part)"
         )
     return imaged
@@ -149,7 +149,7 @@ def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]
 
 
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
-    """Return the pixels of `positions [D, 3]`; points that cannot be imaged get distinct pixels far outside the image."""
+    """Return the pixels of `positions [D, 3]`; points that cannot be projected get distinct pixels far outside the image."""
     pixels = sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
     outside = -float(max(sensor.camera.image_size)) * (2 + np.arange(len(pixels)))
     seen = np.isfinite(pixels).all(1) & visible(sensor, positions)
