@@ -32,11 +32,12 @@ SPARE = 1.3  # number of blobs searched per dot
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
-    """`[1, 1, H, W]` 1 where dots may be, 2 pixels off the rim, else 0: in the short triangles between dots and anchors, and in
-    those of a dot near dots.
+    """Return the mask `[1, 1, H, W]` of the pixels where dots can be: 1 more than 2 pixels inside the rim, else 0.
+
+    It covers the short triangles between dots and anchors, and the vicinity of the dots in the long triangles of a dot.
 
     Raises:
-        MembraneError: all of them lie outside the image.
+        MembraneError: the whole mask lies outside the image.
     """
     width, height = image_size
     if anchors is None:
@@ -76,7 +77,7 @@ def is_inside(pixels: Tensor, image: Tensor) -> Tensor:
 
 
 def short(image: Tensor) -> Tensor:
-    """An image in 0..1 with so few digits that float32 holds its means over 4 x 4 pixels: these are alike in whatever order.
+    """Round an image in 0..1 to so few digits that float32 sums over 4 x 4 pixels are exact, whatever their order.
 
     Example:
         >>> bool(short(torch.tensor(0.7)) == round(0.7 * 2**20) / 2**20)
@@ -96,32 +97,33 @@ def rounded(value: Tensor, step: float) -> Tensor:
 
 
 class DotLocator(nn.Module):
-    """Pixels of the pattern's dots in each frame of a batch, with a confidence.
+    """Locates the pattern's dots in each frame of a batch, with a confidence.
 
-    Blobs at the pattern's scales, matched from where the dots were or else by a smooth flow on which neighbours agree, then a
-    least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
+    Blobs are detected at the pattern's scales and matched, from the previous positions of the dots or else by a smooth flow on
+    which neighbours agree. A blurred ellipse on a sloping background is then fitted to each. A lost dot has confidence 0 and
+    its predicted pixel.
 
     Args:
         pattern: the markers in the rest image.
         image_size: width, height.
         polarity: "dark" or "light".
-        anchors: pixels `[A, 2]` of the rim, closer together than the dots, beyond which no dot is looked for; default:
-            anywhere in the image.
+        anchors: pixels of the rim, `[A, 2]`, closer together than the dots; no dot is searched beyond them; default: dots
+            are searched in the whole image.
 
     Attributes:
         follows: True; dots are followed from frame to frame.
 
     Raises:
-        MembraneError: another polarity, fewer than 6 dots, or dots that are not finite.
+        MembraneError: the polarity is unknown, there are fewer than 6 dots, or dots are not finite.
 
     Limitations:
-        The flow may change by at most about half a pitch from one dot to the next: wrong where the spacing is below about
-        half of that at rest, where the middle of the pattern turns by more than about 30 degrees against its outline, or where
-        a part of it moves by more than two and a half pitches. Most such regions end in a seam and are lost with all that is
-        near it; what is left is confidently a whole pitch off, one-size patterns more often. A lattice that moves as a whole by
-        one of its steps is told from one at rest by its outline: by dots that are lost, and found, there. A dot that is missing
-        beside a blob of its size may be taken for it. Where many dots are missing (20 %) and as many false ones stand among
-        them, right dots are lost as well.
+        The flow may change by at most about half a pitch from one dot to the next. Matches are wrong where the spacing is below
+        about half of that at rest, where the middle of the pattern turns by more than about 30 degrees relative to its outline,
+        or where a part of it moves by more than 2.5 pitches. Most such regions end in a seam and are lost with their vicinity;
+        the remaining ones are off by a whole pitch with high confidence, more often for patterns of one size. A lattice that
+        moves as a whole by one of its steps is distinguished from one at rest by its outline alone: by the dots that are lost,
+        and found, there. A missing dot may be mistaken for a blob of its size beside it. If many dots are missing (20 %) and
+        there are as many false ones, correct dots are lost as well.
 
     Example:
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
@@ -165,7 +167,7 @@ class DotLocator(nn.Module):
         self.float()
 
     def be_exact(self) -> None:
-        """As of `Locator`: the fit in double precision, from a start that is rounded."""
+        """As in `Locator`: the fit runs in double precision, from a rounded start."""
         self.is_exact = True
         self.fit.double()
         self.shapes = self.shapes.double()
@@ -179,9 +181,9 @@ class DotLocator(nn.Module):
         """Locate the dots in a batch of frames.
 
         Args:
-            image: `[B, 1, H, W]`, grey in 0..1.
-            previous: pixels `[B, D, 2]` in the frames before, NaN where lost, from which the dots are followed; without it
-                from rest.
+            image: images, `[B, 1, H, W]`, grey in 0..1.
+            previous: pixels in the previous frames, `[B, D, 2]`, from which the dots are followed, NaN for lost dots;
+                without it dots are followed from rest.
         """
         level_0, level_1, level_2, blobs, log_radius, valid = self.begin(image)
         place, certainty, strain = self.match(blobs, log_radius, valid, previous)
@@ -232,5 +234,5 @@ class DotLocator(nn.Module):
         return LocatedMarkers(pixels, confidence, fitted.covariance)
 
     def _alike(self, value: Tensor, step: float) -> Tensor:
-        """The value, or where every runtime is to have the same, its nearest multiple of a step."""
+        """Return the value, or its nearest multiple of a step if every runtime must compute the same."""
         return rounded(value, step) if self.is_exact else value

@@ -27,18 +27,18 @@ State = tuple[Tensor, Tensor, Tensor]
 class DotMatcher(nn.Module):
     """Assigns blobs of a frame to the dots of the rest image.
 
-    Nothing is known of the flow but that it is smooth. Dots are followed from where they were, or else, where one cannot be,
-    searched for: the pattern is laid on the blobs as a whole (`Alignment`), then neighbours agree on their blobs
-    (`NeighbourAgreement`), a second time from where the first time says. A few steps then predict every dot from the sure
-    ones around it and the local deformation, take the blob nearest to the prediction and of its size, and keep it where the
-    choice is mutual. Where some are lost, those that took another's blob are let go, and may find their own. What is returned
-    follows from which blob is which dot's alone, not from how that was found.
+    The flow is only assumed to be smooth. Dots are followed from their previous positions. If one cannot be followed, all are
+    searched for: the pattern is aligned with the blobs as a whole (`Alignment`), then neighbours agree on their blobs
+    (`NeighbourAgreement`), repeatedly from the positions found before. A few steps then predict every dot from the confident
+    dots around it and the local deformation, choose the nearest blob of its size, and keep it if the choice is mutual. If some
+    dots are lost, those that took another's blob are released and may find their own. The result depends on which blob belongs
+    to which dot alone, not on how this was found.
 
     Args:
-        pixels: centres `[D, 2]` of the dots at rest, px.
-        log_radius: `[D]`, as the blob detector finds it at rest.
+        pixels: centres of the dots at rest, `[D, 2]`, px.
+        log_radius: log radii from the blob detector at rest, `[D]`.
         size_tolerance: standard deviation of a dot's log radius.
-        seen: `[D]` bool, which of them are in the image at rest.
+        seen: which of them are in the image at rest, `[D]` bool.
 
     Limitations:
         See `DotLocator`.
@@ -121,14 +121,14 @@ class DotMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Match a batch of frames.
 
-        The dots are followed from where they were in the frames before, or from rest without these or where half of them
-        were lost. In a frame in which one cannot be followed all are searched for.
+        The dots are followed from the previous frames, or from rest if there are none or half of the dots were lost. In a frame
+        in which a dot cannot be followed, all are searched for.
 
         Args:
-            blobs: `[B, K, 2]`, px.
-            log_radius: of the blobs `[B, K]`.
-            valid: how surely each is a dot `[B, K]`, in 0..1.
-            previous: pixels `[B, D, 2]` in the frames before, NaN where lost.
+            blobs: positions of the blobs, `[B, K, 2]`, px.
+            log_radius: log radii of the blobs, `[B, K]`.
+            valid: probability that each blob is a dot, `[B, K]`, in 0..1.
+            previous: pixels in the previous frames, `[B, D, 2]`, NaN for lost dots.
 
         Returns:
             Positions `[B, D, 2]` px, certainty `[B, D]` in 0..1 and strain `[B, D, 2, 2]`.

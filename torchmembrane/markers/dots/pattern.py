@@ -21,9 +21,9 @@ class DotPattern(NamedTuple):
     """Markers as measured in the rest image.
 
     Attributes:
-        pixels: centres `[D, 2]` (u, v), px.
-        shapes: `[D, 2, 2]`, pixel = centre + shape @ (unit circle).
-        sizes: `[D]` int, 0 = small, 1 = large (one size only: all 1).
+        pixels: centres (u, v), `[D, 2]`, px.
+        shapes: shapes, `[D, 2, 2]`; pixel = centre + shape @ (unit circle).
+        sizes: sizes, `[D]` int, 0 = small, 1 = large (all 1 if there is one size only).
     """
 
     pixels: np.ndarray
@@ -70,12 +70,12 @@ def size_classes(pixels: np.ndarray, shapes: np.ndarray) -> np.ndarray:
 
 @telling_bits
 def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) -> DotPattern:
-    """Find all dots of the pattern in the rest image, any arrangement, one size or two.
+    """Find all dots of the pattern in the rest image, in any arrangement and of one or two sizes.
 
     Args:
-        image: `[H, W]`, grey in 0..1.
+        image: the rest image, `[H, W]`, grey in 0..1.
         polarity: "dark" or "light".
-        mask: `[H, W]` bool, where to look, or None: everywhere.
+        mask: where to search, `[H, W]` bool; None: everywhere.
 
     Returns:
         The pattern, in rows from top to bottom.
@@ -84,7 +84,7 @@ def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) 
         MembraneError: fewer than 6 dots are found.
 
     Limitations:
-        Dots that touch one another or the edge of the membrane are not found.
+        Dots that touch each other or the edge of the membrane are not found.
 
     Example:
         >>> from torchmembrane.markers.dots.ellipse import draw_dots
@@ -114,15 +114,15 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
     """Measure the listed dots in the rest image.
 
     Args:
-        image: `[H, W]`, grey in 0..1.
-        pixels: predicted centres `[D, 2]`, off by up to half a pitch.
-        shapes: `[D, 2, 2]` px, of dots of unit radius.
-        sizes: `[D]` int, 0 = small, 1 = large.
+        image: the rest image, `[H, W]`, grey in 0..1.
+        pixels: predicted centres, `[D, 2]`, px; errors of up to half a pitch are allowed.
+        shapes: shapes of dots of unit radius, `[D, 2, 2]` px.
+        sizes: sizes, `[D]` int, 0 = small, 1 = large.
         polarity: "dark" or "light".
 
     Returns:
-        The pattern in the order given, shapes scaled by each size's radius as found, the centre NaN where a dot is not
-        visible.
+        The pattern in the given order, with the shapes scaled by the measured radius of each size; the centre is NaN for dots
+        that are not visible.
 
     Raises:
         MembraneError: fewer than 6 dots are found.

@@ -40,9 +40,9 @@ def dot_evidence(explained: Tensor) -> Tensor:
 
 
 def contrast_evidence(contrast: Tensor, middle: float = 0.5) -> Tensor:
-    """Log odds of a dot against something fainter, from its contrast over that of the frame's clearer dots.
+    """Return the log odds of a dot against something fainter, from its contrast relative to the frame's clearer dots.
 
-    Both are normal, with `CONTRAST_DEVIATION` and 1 apart, about `middle`: of what is none about 0, of dots about 1.
+    Both have normal distributions with `CONTRAST_DEVIATION` and means that differ by 1; `middle` is half way between the means.
 
     Example:
         >>> contrast_evidence(torch.tensor([1.0, 0.5, 0.0])).round().tolist()
