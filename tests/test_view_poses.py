@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial import cKDTree
 from test_views import BESIDE, CAMERA, MIRROR, cap
 
 import torchmembrane as tm
-from torchmembrane.calibrate.view_poses import placed_view, recognised, with_found
+from torchmembrane.calibrate.view_poses import _partners, placed_view, recognised, with_found
 from torchmembrane.cli.draft_views import looking_at
 from torchmembrane.cli.main import main
 from torchmembrane.markers.dots.pattern import DotPattern
@@ -35,6 +36,13 @@ def images():
     """Of a camera beside the first one and of a mirror, at rest."""
     simulator = Simulator(cap(*(View(name, CAMERA, pose) for name, pose in POSES.items())))
     return simulator.images(simulator.membrane.rest, np.random.default_rng(0))
+
+
+def test_dots_are_partners_if_each_is_the_others_nearest_within_a_third_of_the_pitch():
+    """The first two expected dots have the same nearest one; the last one's is too far away."""
+    expected = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]])
+    found = np.array([[4.4, 0.0], [0.3, 0.0], [1.3, 0.0], [2.1, 0.0], [3.0, 0.1]])
+    assert _partners(expected, found, cKDTree(found)).tolist() == [-1, 1, 2, 3, 4, -1]
 
 
 def off(found, true):
