@@ -40,9 +40,8 @@ def images():
 
 def test_dots_are_partners_if_each_is_the_others_nearest_within_a_third_of_the_pitch():
     """The first two expected dots have the same nearest one; the last one's is too far away."""
-    expected = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]])
-    found = np.array([[4.4, 0.0], [0.3, 0.0], [1.3, 0.0], [2.1, 0.0], [3.0, 0.1]])
-    assert _partners(expected, found, cKDTree(found)).tolist() == [-1, 1, 2, 3, 4, -1]
+    expected, found = (np.array([[u, 0.0] for u in row]) for row in ([0, 0.5, 1, 2, 3, 4, 5, 6], [6.4, 0.3, 1.3, 2.1, 3, 4, 5]))
+    assert _partners(expected, found, cKDTree(found)).tolist() == [-1, 1, 2, 3, 4, 5, 6, -1]
 
 
 def off(found, true):

@@ -18,7 +18,7 @@ def refuse_untested(installed: str | None = None) -> None:
     found = installed or version("lerobot")
     if ".".join(found.split(".")[:2]) != TESTED:
         raise ImportError(
-            f"lerobot_camera_torchmembrane was tested with lerobot {TESTED}, and {found} is installed. The plugin does not change "
-            "LeRobot: use the release of the plugin for your version, or install "
+            f"lerobot_camera_torchmembrane was tested with lerobot {TESTED}, and {found} is installed. The plugin does not "
+            "change LeRobot: use the release of the plugin for your version, or install "
             f'"lerobot>={TESTED},<0.7" in an environment of its own'
         )
