@@ -125,7 +125,7 @@ CHANGED = {
     "semicolons and decimal commas": (lambda lines: semicolons(decimal_commas(lines)), "the header is"),
     "semicolons below the header": (lambda lines: [lines[0], *semicolons(lines[1:])], "line 2: "),
     "tabs": (lambda lines: [line.replace(",", "\t") for line in lines], "line 1: the header is"),
-    "decimal commas": (decimal_commas, "commas between columns alone, numbers with a decimal point"),
+    "decimal commas": (decimal_commas, "commas only between columns, numbers with a decimal point"),
     "a column less": (lambda lines: [line.partition(",")[2] for line in lines], "line 1: the header is"),
     "a column too many": (lambda lines: [f"{line},{'note' if k == 0 else k}" for k, line in enumerate(lines)], "the header is"),
     "a cell too many": (lambda lines: [*lines[:-1], f"{lines[-1]},1"], "values, "),

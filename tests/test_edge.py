@@ -440,7 +440,7 @@ def test_values_of_a_camera_of_fewer_bits_are_shares_of_its_white(bits, tmp_path
     assert code == 1 and "2 reconstructed, 2 failed" in out
     for name in ("good", "eight"):
         np.testing.assert_allclose(seen(tmp_path / "r", name), TRUE, atol=0.51 / white)
-    assert f"values up to {white + 1}; expected at most {white}, of the {bits} bits that the model states" in err
+    assert f"values up to {white + 1}; expected at most {white} for the {bits} bits that the model states" in err
     assert "rgb.png: colour or alpha with more than 8 bits" in err
 
 

@@ -77,7 +77,7 @@ def test_each_view_is_its_own_input(model):
         (images(0, 0)[:1], "not a list of 2"),
         ([images(0, 0)[0], images(0, 0, 2)[1]], r"\[1, 2\] images of the views left, right"),
         (images(0, 0)[::-1], "expected 8 x 6"),
-        ([None, None], r"\[\] images of the views left, right; expected as many of each, of one view at least"),
+        ([None, None], r"\[\] images of the views left, right; expected the same number for each, for at least one view"),
     ):
         with pytest.raises(edge.EdgeError, match=said):
             session.run(wrong)

@@ -184,5 +184,5 @@ def test_rerun_that_is_broken_is_not_called_missing(stream, monkeypatch, tmp_pat
     (tmp_path / "rerun/__init__.py").write_text(content)
     monkeypatch.delitem(sys.modules, "rerun", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(tm.MembraneError, match=r"is installed and cannot be imported \(.*(no_such_module|libnone)"):
+    with pytest.raises(tm.MembraneError, match=r"is installed but cannot be imported \(.*(no_such_module|libnone)"):
         RerunLog(stream.mesh, "never.rrd")

@@ -429,4 +429,4 @@ def test_relative_forces_are_no_newtons(tmp_path, gas_sensor, pictures, capsys):
     run = write_bag(tmp_path / "run", StoragePlugin.MCAP, [(TOPIC, raw(0, pictures[0], "mono8"))])
     command = ["reconstruct", str(sensor), str(run), "--out", str(tmp_path / "out"), "--bag", str(tmp_path / "forces")]
     assert main(command) == 2 and not (tmp_path / "forces").exists()
-    assert "forces of cap are relative, messages are in newtons: add shear_modulus" in capsys.readouterr().err
+    assert "forces of cap are relative, but messages are in newtons: add shear_modulus" in capsys.readouterr().err

@@ -105,7 +105,7 @@ class Session:
         }
         counts = [len(part) for part in parts.values()]
         if len(set(counts)) != 1:
-            raise EdgeError(f"{counts} images of the views {views}; expected as many of each, of one view at least")
+            raise EdgeError(f"{counts} images of the views {views}; expected the same number for each, for at least one view")
         blank = {
             name: np.full((counts[0], 1, height, width), np.nan, np.float32)
             for name, (width, height) in zip(self._images, self.image_sizes, strict=True)
@@ -201,7 +201,7 @@ def grey(images: Any, bits: int | None = None) -> np.ndarray:
         if bits and images.dtype.itemsize == 2:
             white = 2**bits - 1
             if (most := images.max(initial=0)) > white:
-                raise EdgeError(f"values up to {most}; expected at most {white}, of the {bits} bits that the model states")
+                raise EdgeError(f"values up to {most}; expected at most {white} for the {bits} bits that the model states")
     elif images.dtype.kind != "f":
         raise EdgeError(f"images of type {images.dtype}; expected uint8, uint16 or float in 0..1")
     if images.ndim == 4:

@@ -1,4 +1,4 @@
-"""Presses of the trials: strokes of increasing depth, and pairs of balls at decreasing distance."""
+"""Simulated presses for the accuracy trials: strokes of increasing depth, and pairs of balls at decreasing distance."""
 
 from collections.abc import Sequence
 from itertools import islice

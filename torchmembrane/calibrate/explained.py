@@ -192,7 +192,8 @@ def coarse_reconstructor(sensor: Sensor) -> Reconstructor:
     sensor.refuse_heights("calibrate material")
     if sensor.material.model == "harmonic":
         raise MembraneError(
-            "calibrate material: a harmonic membrane has one shape at any prestretch; expected neo_hookean or mooney_rivlin"
+            "calibrate material: the shape of a harmonic membrane does not depend on the prestretch; expected neo_hookean or "
+            "mooney_rivlin"
         )
     return Reconstructor(replace(sensor, membrane=sensor.surface.membrane(GRID)), dtype=torch.float64)
 

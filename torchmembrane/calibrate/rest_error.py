@@ -139,9 +139,9 @@ class StatedHeight(NamedTuple):
     """The prior of the height of a rest surface over its rim.
 
     Attributes:
-        error: standard deviation of the stated height, over the surface's height.
+        error: standard deviation of the stated height, relative to the surface's height.
         mean: stated height minus the surface's height, in standard deviations.
-        reach: step of the height to either side with which its effect is computed, in standard deviations.
+        reach: change of the height, up and down, from which the height's effect is computed, in standard deviations.
     """
 
     error: float

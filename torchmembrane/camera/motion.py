@@ -11,8 +11,8 @@ LARGEST_SHIFT = 0.03
 
 
 def motion_of_pixels(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Return the derivatives `[..., 2, 4]` of `pixels [..., 2]` with respect to du, dv, rotation and scaling, the latter two in
-    px at half the image's diagonal from its centre."""
+    """Return the derivatives `[..., 2, 4]` of `pixels [..., 2]` with respect to du, dv, rotation and scaling. The latter two
+    are given as the displacement in px of a point half the image's diagonal from its centre."""
     twice_half = 2 * _half_diagonal(image_size)
     u, v = ((2 * along - (size - 1)) / twice_half for along, size in zip(pixels.unbind(-1), image_size, strict=True))
     one, none = torch.ones_like(u), torch.zeros_like(u)

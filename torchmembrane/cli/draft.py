@@ -124,7 +124,7 @@ def refuse_foreign(arguments: Namespace) -> None:
             raise MembraneError(f"init: --{name.replace('_', '-')} is not a length of a {arguments.shape}; expected {expected}")
     for one, other in (("focal", "view"), ("dots", "pitch"), ("rest", "pitch")):
         if getattr(arguments, one) is not None and getattr(arguments, other) is not None:
-            raise MembraneError(f"init: --{one} and --{other}; expected only one of them, because they state the same")
+            raise MembraneError(f"init: --{one} and --{other}; expected only one of them, because they are alternatives")
     if arguments.rim is not None and (arguments.rest is None or "radius" not in SHAPES[arguments.shape][:1]):
         raise MembraneError("init: --rim; expected a round membrane (dome, cap, bubble) and the image it is read from, --rest")
     if arguments.rim is not None and arguments.distance is not None and (arguments.focal or arguments.view):

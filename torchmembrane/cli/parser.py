@@ -47,7 +47,7 @@ def _appended(question: str) -> str:
 
 
 def negative_joined(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments with each one that begins with a minus sign and a digit joined to the option before it, as its
+    """Return the arguments; each one that begins with a minus sign and a digit is joined to the option before it, as its
     value.
 
     Example:

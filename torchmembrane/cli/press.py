@@ -43,7 +43,7 @@ def simulate(arguments: Namespace) -> int:
     torch.set_num_threads(1)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     if arguments.video and sensor.views_apart:
-        raise MembraneError("--video: the sensor's views have images of their own; expected images, or regions of one image")
+        raise MembraneError("--video: each view has its own image; leave --video out, or use a sensor with views in one image")
     _spare_files(arguments, sensor.views_apart)
     appearance = Appearance(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
     options = arguments.grid, appearance, arguments.dots, arguments.missing

@@ -63,7 +63,7 @@ class Observation(NamedTuple):
     confidence  [B, D]  confidence of the markers, 0 for a lost one, else up to 1
     across      [B, N, 2, 3]  two vectors orthogonal to each ray, scaled such that angles along them are in standard deviations
                 of the marker; None: the noise is the same for all rays and directions
-    motion      [B, N, 2, 4 W]  derivatives of these angles in the motion of the camera, from `marker_residuals.marker_rays`;
+    motion      [B, N, 2, 4 W]  derivatives of these angles with respect to camera motion, from `marker_residuals.marker_rays`;
                 None: the camera has not moved
     gauge       [B, 2]  reading of a pressure gauge, from `pressure_gauge.gauge_reading`; None: there is no gauge
     """

@@ -213,7 +213,7 @@ def _names(cells: Sequence[str]) -> list[str]:
 
 def _cells(path: Path, line: int, cells: list[str], names: list[str]) -> list[str]:
     if len(cells) < len(names) or any(cells[len(names) :]):
-        wanted = f"{COUNTS[len(names)]}, {','.join(names)}: commas between columns alone, numbers with a decimal point"
+        wanted = f"{COUNTS[len(names)]}, {','.join(names)}: commas only between columns, numbers with a decimal point"
         raise MembraneError(f"{path}, line {line}: {len(cells)} values, {in_one_line(','.join(cells))}; expected {wanted}")
     return cells[: len(names)]
 

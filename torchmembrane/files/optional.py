@@ -107,6 +107,6 @@ def _load(module: str, purpose: str, extra: str) -> Any:
         if isinstance(error, ModuleNotFoundError) and error.name == module:
             raise MembraneError(f'{purpose}, which is not installed: pip install "torchmembrane[{extra}]"') from error
         raise MembraneError(
-            f"{purpose}, which is installed and cannot be imported ({in_one_line(error)}): install it anew, "
+            f"{purpose}, which is installed but cannot be imported ({in_one_line(error)}): reinstall it, "
             f'pip install --force-reinstall "torchmembrane[{extra}]"'
         ) from error

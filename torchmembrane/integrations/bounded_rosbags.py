@@ -45,7 +45,7 @@ def bounded_rosbags() -> Any:
 
 
 def refuse_large(reader: Any) -> None:
-    """Refuse an open bag whose chunks unpack to far more than the size of its files, since many may be in memory at once.
+    """Refuse an open bag whose chunks unpack to far more than its files' size, because many chunks may be in memory at once.
 
     Raises:
         ValueError: the bag is too large; the message states by how much.
@@ -64,7 +64,7 @@ def _refuse_packed(size: int, packed: int) -> None:
 def _unpacked(decompressor: Callable[[], Any], content: bytes, size: int = MOST_CHUNK_BYTES) -> bytes:
     """Return unpacked data; refuse a declared size that is too large, and data that unpack to more than that."""
     if size > MOST_CHUNK_BYTES:
-        raise ValueError(f"a chunk unpacks to {size} bytes; at most {MOST_CHUNK_BYTES} are read: record it in smaller chunks")
+        raise ValueError(f"a chunk unpacks to {size} bytes; at most {MOST_CHUNK_BYTES} are read: record smaller chunks")
     unpacked: bytes = decompressor().decompress(content, max_length=size + 1)
     if len(unpacked) > size:
         raise ValueError(f"a chunk or message unpacks to more than {size} bytes")

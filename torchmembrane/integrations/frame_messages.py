@@ -74,8 +74,8 @@ class SiUnits:
     def __init__(self, mesh: Mesh, gas_pressure: float | None = None):
         if mesh.force_unit != "N":
             raise MembraneError(
-                f"forces of {mesh.name} are relative, messages are in newtons: add shear_modulus and thickness to the sensor "
-                "file, or find them by `torchmembrane calibrate material --weight`"
+                f"forces of {mesh.name} are relative, but messages are in newtons: add shear_modulus and thickness to the "
+                "sensor file, or find the stiffness by `torchmembrane calibrate material --weight`"
             )
         self.name, self.metre, self.views = mesh.name, METRE[mesh.length_unit], mesh.view_names.split()
         self.gas_pressure = gas_pressure

@@ -213,7 +213,7 @@ def _rows(columns: Any) -> Iterator[tuple[Any, Any, Any]]:
     if alone := [key for key in columns if not _is_column(columns[key])]:
         raise MembraneError(
             f"FrameReconstructor: column {alone[0]} is a {_kind(columns[alone[0]])}; expected a list or an array of one value "
-            "a row: in Ray, map_batches in place of map"
+            "per row: in Ray, use map_batches in place of map"
         )
     lengths = {str(key): len(columns[key]) for key in columns}
     count = max(lengths.values(), default=0)

@@ -115,7 +115,7 @@ def _free(graph: ir.Graph) -> None:
     for node in list(graph):
         given = [] if node.op_type == "Constant" else node.attributes.values()
         if any(_depends(np.asarray(each.value)) for each in given if each.type in NUMBERS):
-            raise ValueError(f"the batch's length is an attribute of {node.op_type}")
+            raise ValueError(f"the batch size is an attribute of {node.op_type}")
         for k, value in enumerate(node.inputs):
             constant = None if value is None else ir.convenience.get_const_tensor(value)
             if constant is None or constant.size > LENGTHS or not _depends(constant.numpy()):

@@ -22,8 +22,8 @@ class WorkingRange(NamedTuple):
 
     Attributes:
         depth: largest displacement along the inward rest normal, over the surface's size.
-        turn: largest rotation of the vertices' normals, degrees, except for the share `TURNED` of the vertices: beside the rim
-            even a shallow press rotates the surface far.
+        turn: largest rotation of the vertices' normals, degrees. The share `TURNED` of the vertices is excluded, because even a
+            shallow press rotates the surface far beside the rim.
         force: largest magnitude of the contact force, the sensor's force unit.
         sensor: fingerprint of the sensor for which the range was found; empty: valid for any sensor.
     """

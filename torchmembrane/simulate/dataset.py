@@ -97,8 +97,8 @@ def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator, se
     weight = np.where(off_rim if seen is None else off_rim & seen, membrane.rest_area.numpy(), 0.0)
     if not weight.any():
         raise MembraneError(
-            f"sensor {simulator.sensor.name!r}: no part of the membrane that may be pressed lies {OFF_RIM * size:.3g} off its "
-            "rim; expected one, in view of the camera: check the camera and the rest surface"
+            f"sensor {simulator.sensor.name!r}: no part of the membrane that may be pressed is more than {OFF_RIM * size:.3g} "
+            "away from its rim; expected one in view of the camera: check the camera and the rest surface"
         )
     target = rng.choice(len(X), p=weight / weight.sum())
     kind = plan.kinds[int(rng.integers(len(plan.kinds)))]

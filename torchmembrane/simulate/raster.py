@@ -84,7 +84,7 @@ class LinearOnTriangles(NamedTuple):
 
     Attributes:
         value: values at the first corner of each triangle, `[T, C]`.
-        slope: derivatives of the values in the image, `[T, C, 2]`.
+        slope: derivatives of the values with respect to image position, `[T, C, 2]`.
         corner: first corner of each triangle, `[T, 2]`.
     """
 

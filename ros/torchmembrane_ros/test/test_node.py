@@ -249,7 +249,7 @@ def test_relative_forces_are_no_newtons(system_of, sensor, tmp_path, capfd):
     full = tm.Sensor.from_file(sensor)
     relative = replace(full, material=replace(full.material, shear_modulus=None, thickness=None))
     assert system_of(relative.to_file(tmp_path / "sensor.toml")).node.trigger_configure() == FAILURE
-    assert "are relative, messages are in newtons" in capfd.readouterr().err
+    assert "are relative, but messages are in newtons" in capfd.readouterr().err
 
 
 def test_parameters_are_described_and_do_not_change(system):

@@ -125,10 +125,10 @@ def read_sensor_image(path: str | Path, sensor: Sensor, number: int = 0) -> np.n
 
 
 def read_view_images(path: str | Path, sensor: Sensor) -> list[np.ndarray]:
-    """The images of all views, `[H, W]` each: those beside the first view's, NAME_VIEW, or their regions of one.
+    """Read the images of all views, `[H, W]` each: the files NAME_VIEW beside that of the first view, or regions of one image.
 
     Raises:
-        MembraneError: one is missing, or of another size.
+        MembraneError: an image is missing or has another size.
     """
     names = sensor.views_apart
     files = view_files(Path(path), names) if names else [Path(path)] * len(sensor.views)

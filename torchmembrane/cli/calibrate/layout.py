@@ -26,5 +26,5 @@ def layout(arguments: Namespace) -> int:
     write_svg(arguments.out / "layout.svg", sensor, dots)
     title = f"{len(dots.radii)} dots, radii {dots.radii.min():.3g} to {dots.radii.max():.3g} {sensor.length_unit}"
     save(layout_figure(title, sensor, dots), arguments.out / "report.png", "calibrate")
-    print(f"{title}\n{arguments.out / 'layout.csv'} to fabricate, layout.svg to look at, and the sensor that has them: {path}")
+    print(f"{title}\n{arguments.out / 'layout.csv'} for fabrication, layout.svg for viewing, sensor with these dots: {path}")
     return 0

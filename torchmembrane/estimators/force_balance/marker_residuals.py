@@ -105,7 +105,7 @@ class MarkerResiduals(nn.Module):
         membrane: the rest surface on the solver's grid.
         markers: the markers as points on the rest surface.
         positions: rest positions of the markers, `[D, 3]`.
-        noise: standard deviation of a marker's angles, radians, for observations without their own.
+        noise: standard deviation of a marker's angles, radians, for observations without noise of their own.
         rest: the markers' rays at rest; None: rays from the origin, with `noise`.
         views: number of views that see the markers, which are listed once for each view.
     """

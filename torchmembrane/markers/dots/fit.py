@@ -53,8 +53,8 @@ class EllipseFit(nn.Module):
     """Least-squares fit of a blurred ellipse on a sloping background, `I = b_0 + b . y - a T(x - c)`, to every dot.
 
     It takes Gauss-Newton steps on windows of the pyramid level that suits the dot's size. Dark pixels outside the outline, such
-    as a neighbour or objects beyond the rim, lose their weight. Pixel offsets are in pixels of that level; position, size and
-    growth of a dot are relative to the softness of its outline.
+    as a neighbour or objects beyond the rim, are down-weighted. Pixel offsets are in pixels of that level; position, size and
+    growth of a dot are in units of the softness of its outline.
 
     Args:
         pixels: centres in the rest image, `[D, 2]`, px.

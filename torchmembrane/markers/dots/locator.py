@@ -122,7 +122,7 @@ class DotLocator(nn.Module):
         or where a part of it moves by more than 2.5 pitches. Most such regions end in a seam and are lost with their vicinity;
         the remaining ones are off by a whole pitch with high confidence, more often for patterns of one size. A lattice that
         moves as a whole by one of its steps is distinguished from one at rest by its outline alone: by the dots that are lost,
-        and found, there. A missing dot may be mistaken for a blob of its size beside it. If many dots are missing (20 %) and
+        and found, there. A blob of its size beside a missing dot may be mistaken for it. If many dots are missing (20 %) and
         there are as many false ones, correct dots are lost as well.
 
     Example:

@@ -15,7 +15,7 @@ WARP_DAMPING = 1e-3  # grey^2: keeps weak texture from bending a patch's own aff
 
 
 def square_offsets(radius: int) -> Tensor:
-    """Return integer offsets `[(2 radius + 1)^2, 2]` in rows of u.
+    """Return the integer offsets (u, v) in a square, `[(2 radius + 1)^2, 2]`, row by row with u varying fastest.
 
     Example:
         >>> square_offsets(1)[:4].tolist()
