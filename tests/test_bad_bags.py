@@ -173,7 +173,7 @@ def test_chunks_are_not_unpacked_beyond_what_is_read(tmp_path, packing):
     for content, said in (
         (
             mcap(chunk(2**29, packing, packed)),
-            "a chunk unpacks to 536870912 bytes; at most 268435456 are read: record it in smaller",
+            "a chunk unpacks to 536870912 bytes; at most 268435456 are read: record smaller",
         ),
         (mcap(chunk(100, packing, packed)), "unpacks to more than 100 bytes"),
         (mcap(chunk(2**40, packing, half)), "a chunk unpacks to 1099511627776 bytes"),
