@@ -122,7 +122,7 @@ def _free(graph: ir.Graph) -> None:
                 continue
             numbers = constant.numpy()
             if numbers.dtype != np.int64:
-                raise ValueError(f"{node.op_type} depends on the batch's length, as a number")
+                raise ValueError(f"{node.op_type} depends on the batch size, as a number")
             of_batch = numbers % MANY == 0
             if node.op_type == "Reshape" and of_batch.sum() == 1 and (numbers > 0).all():
                 free = [ir.node("Constant", [], {"value": ir.tensor(np.where(of_batch, -1, numbers))})]

@@ -1,0 +1,61 @@
+"""Processor time of loading an exported model, and of a frame of it, with onnxruntime's reuse of memory and without.
+
+python -m bench.speed.loading MODEL.onnx [--rounds 60] [--loads 3]
+
+One thread; processor time, as other programs may share the cores. The edge package loads models without the reuse. Times of
+loading are medians over the loads, in turn. The frame is noise, and a tracking model gets no previous frame; both sessions run it
+in turn, and the ratio is the median over the runs.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+TYPES = {"tensor(float)": np.float32, "tensor(uint8)": np.uint8}
+
+
+def session_of(path: Path, reuse: bool) -> tuple[onnxruntime.InferenceSession, float]:
+    """Return a session of the model, and the seconds that loading it takes."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level, options.enable_mem_reuse = 1, 3, reuse
+    start = time.process_time()
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return session, time.process_time() - start
+
+
+def frame_of(session: onnxruntime.InferenceSession) -> dict[str, np.ndarray]:
+    """Return inputs of one frame: noise as images, NaN as results of the frame before."""
+    rng, feed = np.random.default_rng(0), {}
+    for given in session.get_inputs():
+        noise = rng.random([1, *given.shape[1:]])
+        feed[given.name] = (noise if given.name.startswith("image") else np.nan * noise).astype(TYPES[given.type])
+    return feed
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("--rounds", type=int, default=60)
+    parser.add_argument("--loads", type=int, default=3)
+    args = parser.parse_args()
+    loads = [[session_of(args.model, reuse) for reuse in (True, False)] for _ in range(args.loads)]
+    sessions, feed, times = [session for session, _ in loads[-1]], frame_of(loads[-1][0][0]), []
+    for _ in range(args.rounds):
+        each = []
+        for session in sessions:
+            start = time.process_time()
+            session.run(None, feed)
+            each.append(time.process_time() - start)
+        times.append(each)
+    reuse, without = np.median([[seconds for _, seconds in both] for both in loads], 0)
+    first, second = np.array(times[1:]).T
+    print(f"{args.model}: {args.model.stat().st_size / 1e6:.1f} MB, onnxruntime {onnxruntime.__version__}")
+    print(f"loading: {reuse:.1f} s with reuse of memory, {without:.1f} s without")
+    print(f"a frame: {1e3 * np.median(first):.0f} ms with, without {np.median(second / first):.2f} times as long")
+
+
+if __name__ == "__main__":
+    main()
