@@ -3,8 +3,8 @@
 python -m bench.speed.loading MODEL.onnx [--rounds 60] [--loads 3]
 
 One thread; processor time, as other programs may share the cores. The edge package loads models without the reuse. Times of
-loading are medians over the loads, in turn. The frame is noise, and a tracking model gets no previous frame; both sessions run it
-in turn, and the ratio is the median over the runs.
+loading are medians over the loads. The frame is noise, and a tracking model gets no previous frame. Both sessions run it in
+turn; the ratio is the median over the runs.
 """
 
 import argparse
