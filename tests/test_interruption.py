@@ -120,18 +120,18 @@ def test_the_computation_of_a_frame_is_waited_for_but_not_for_ever(tmp_path):
     assert ended.code == 143 and "closed" not in ended.said and list(tmp_path.iterdir()) == []
 
 
-CLOSING = "try: time.sleep(60)\nfinally: time.sleep({seconds}); print('whole', flush=True)"
+CLOSING = "try: print('inside', flush=True); time.sleep(60)\nfinally: time.sleep({seconds}); print('whole', flush=True)"
 
 
 @FIRST
 def test_what_is_closed_is_not_disturbed_by_a_signal_that_comes_twice_at_once(number, tmp_path):
-    ended = Ended(script(CLOSING.format(seconds=0.6), tmp_path), number, again=0.05)
+    ended = Ended(script(CLOSING.format(seconds=0.6), tmp_path), number, "inside", again=0.05)
     assert ended.code == 128 + number and "whole" in ended.said and "closed" in ended.said
 
 
 @LAST
 def test_a_second_signal_ends_the_process_at_once(number, tmp_path):
-    ended = Ended(script(CLOSING.format(seconds=60), tmp_path), number, again=0.6)
+    ended = Ended(script(CLOSING.format(seconds=60), tmp_path), number, "inside", again=0.6)
     assert ended.code == 128 + number and ended.seconds < SLOW and "whole" not in ended.said
     assert list(tmp_path.iterdir()) == [] and "interrupted; what is done so far is kept" in ended.said
 

@@ -33,7 +33,7 @@ export function greyOf16(values, bits = 16) {
   const white = 2 ** bits - 1;
   const most = values.reduce((high, value) => Math.max(high, value), 0);
   if (most > white) {
-    throw new Error(`values up to ${most}; expected at most ${white}, of the ${bits} bits that the model states`);
+    throw new Error(`values up to ${most}; expected at most ${white} for the ${bits} bits that the model states`);
   }
   return Float32Array.from(values, (value) => value / white);
 }

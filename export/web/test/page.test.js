@@ -177,7 +177,7 @@ test("grey of 16 bits is read as it is, also of a camera of fewer", async () => 
     assert.ok(vertices <= 2e-3 && force <= 2e-3, `${image}: vertices differ by ${vertices} mm, forces by ${force}`);
   }
   await drop(reference("sixteen.png"));
-  assert.match(await text("#message"), /sixteen.png: values up to \d+; expected at most 4095, of the 12 bits that the model states/);
+  assert.match(await text("#message"), /sixteen.png: values up to \d+; expected at most 4095 for the 12 bits that the model states/);
   await drop(reference("colour_16.png"));
   assert.match(await text("#message"), /colour_16.png: colour, alpha or interlacing of 16 bits is read as 8 bits/);
   await page.reload();
