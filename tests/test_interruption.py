@@ -113,7 +113,7 @@ def test_a_signal_ends_whatever_is_done_and_removes_its_part(number, body, tmp_p
 
 def test_the_computation_of_a_frame_is_waited_for_but_not_for_ever(tmp_path):
     body = "interruption.PATIENCE = 0.1\nwith frame_in_work(): compiled(1)\ntime.sleep(60)"
-    ended = Ended(script(body, tmp_path), signal.SIGTERM)
+    ended = Ended(script(body, tmp_path), signal.SIGTERM, delay=0.2)  # within the frame
     assert ended.code == 143 and "closed" in ended.said
     body = "interruption.LONGER = 0.5\nwith frame_in_work(): compiled(60)"
     ended = Ended(script(body, tmp_path), signal.SIGTERM, delay=0.5)  # before the frame begins, it would be closed
@@ -137,8 +137,8 @@ def test_a_second_signal_ends_the_process_at_once(number, tmp_path):
 
 
 def test_closing_that_hangs_and_an_exception_that_is_swallowed_end_in_time(tmp_path):
-    for body in (CLOSING.format(seconds=60), "try: time.sleep(60)\nexcept: time.sleep(60)"):
-        ended = Ended(script(f"interruption.LONGER = 0.5\n{body}", tmp_path), signal.SIGTERM)
+    for body in (CLOSING.format(seconds=60), "try: print('inside', flush=True); time.sleep(60)\nexcept: time.sleep(60)"):
+        ended = Ended(script(f"interruption.LONGER = 0.5\n{body}", tmp_path), signal.SIGTERM, "inside")
         assert ended.code == 143 and ended.seconds < SLOW
 
 
