@@ -53,7 +53,7 @@ def quick_images():
 @pytest.fixture
 def few_steps():
     """Settings for torch.compile and torch.export, which unroll all steps: every branch of the solve, each of few steps."""
-    return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, retry_steps_factor=1, settling_steps=2)
+    return ForceBalanceSettings(steps=(2, 2, 2))
 
 
 @pytest.fixture

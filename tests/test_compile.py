@@ -12,23 +12,12 @@ from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergySetti
 from torchmembrane.machine_code import using
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.solve import implicit
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-FEW = ForceBalanceSettings(steps=2, settling_steps=1, retry_steps_factor=2, retry_acceptance_ratio=1e9)
-"""Steps take long to compile; after so few the first try has not settled, and the second is taken, whatever its objective."""
-
-
-def test_the_second_try_is_taken_in_what_is_compiled_here(monkeypatch):
-    sensor, asked = Sensor.from_file(EXAMPLES / "sensor.toml"), []
-    small = replace(sensor, membrane=sensor.membrane.resampled((9, 9)))
-    reconstructor = Reconstructor(small, dtype=torch.float64, settings=FEW)
-    again = reconstructor.estimator._retry
-    monkeypatch.setattr(reconstructor.estimator, "_retry", lambda *given: asked.append(1) or again(*given))
-    with torch.no_grad():
-        second = reconstructor(reconstructor.read(EXAMPLES / "two_contacts.png"))
-        monkeypatch.setattr(reconstructor.estimator, "chosen", lambda done, values, others: values)
-        first = reconstructor(reconstructor.read(EXAMPLES / "two_contacts.png"))
-    assert asked == [1, 1] and (first.vertices - second.vertices).abs().max() > 1e-3
+SETTINGS = ForceBalanceSettings()
+FEW = ForceBalanceSettings(steps=(4, 2, 2))
+"""Steps take long to compile; of so few, half are damped, because no frame has settled before."""
 
 
 @pytest.fixture(params=[pytest.param("all steps", marks=pytest.mark.full), "few steps"])
@@ -90,24 +79,30 @@ def slope(function, at):
 
 
 @pytest.mark.parametrize("whole", [pytest.param(True, marks=pytest.mark.full), False])
-def test_gradients_compile_in_one_graph_and_agree(settings, whole):
-    """Of the force by pixels; of which the steps alone take a third of the time."""
-    reconstructor = example(settings=settings["force-balance"])
+def test_gradients_compile_in_one_graph_and_agree(whole, monkeypatch):
+    """Of the force by pixels, for a light press, whose steps converge fast: the compiled graph unrolls the last of them."""
+    monkeypatch.setattr(implicit, "UNROLLED_STEPS", 12)
+    reconstructor = example(settings=replace(FEW, steps=(48, 2, 2), settled_step_tol=1e-12))
     with torch.no_grad():
         pixels = reconstructor(reconstructor.read(EXAMPLES / "two_contacts.png")).pixels
+        pixels = reconstructor.rest_pixels + 0.1 * (pixels - reconstructor.rest_pixels)
+    made = reconstructor.estimator
 
-    def stepped(pixels):
-        made = reconstructor.estimator
-        observation = made.prepare(reconstructor.camera, pixels, torch.ones_like(pixels[..., 0]))
-        measured = made.equations.bearings.measured(observation)
-        state, before = made.gauss_newton(made.at_rest(measured.weight), measured, made.schedule()[:2], settling=2)
-        return made.equilibrium(*state, before, measured).traction.square().sum()
+    def measured(pixels):
+        return made.equations.bearings.measured(made.prepare(reconstructor.camera, pixels, torch.ones_like(pixels[..., 0])))
 
-    def loss(pixels):
+    with torch.no_grad():
+        settled, _ = made.gauss_newton(made.at_rest(pixels[..., 0]), measured(pixels), SETTINGS.tau[0], 200)
+
+    def traction(pixels):
+        state = made.gauss_newton.with_gradients(settled, measured(pixels))
+        return made.equilibrium(*state, settled.u, measured(pixels)).traction.square().sum()
+
+    def force(pixels):
         return reconstructor.from_pixels(pixels).force.square().sum()
 
-    function = loss if whole else stepped
+    function = force if whole else traction
     expected = slope(function, pixels)
-    assert expected.abs().max() > 1e-3
+    assert expected.abs().max() > 1e-4
     compiled = torch.compile(function, fullgraph=True, backend="eager")
-    torch.testing.assert_close(slope(compiled, pixels), expected, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(slope(compiled, pixels), expected, rtol=0, atol=1e-4 * expected.abs().max().item())

@@ -21,7 +21,7 @@ from torchmembrane.surface.shapes import spherical_cap
 
 DOME = spherical_cap(12, 9, 3, (33, 33))
 PATCHES = ContactPatches(DOME)
-SURROUNDINGS = TractionLoss(DOME, 1.0, 0.0, ForceBalanceSettings()).surroundings
+SURROUNDINGS = TractionLoss(DOME, 1.0, ForceBalanceSettings()).surroundings
 
 
 def pressed_by(x, centres, radius=3.0, size=0.02, shear=0.0):

@@ -18,8 +18,7 @@ from torchmembrane.control_flow import (
     fori_loop,
     in_inference_mode,
     onnx_function,
-    retry_rows,
-    stacked,
+    repeat_rows,
     traced,
     where_rows,
 )
@@ -30,6 +29,8 @@ DONE = {"all": [2.0, 2.0, 2.0], "none": [-1.0, -2.0, -1.0], "some": [3.0, -1.0, 
 """Numbers above zero where a row is done."""
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+STEPS = (2, 3, 1)
+"""Steps of `Verbs.until` after which each row of `X` is done."""
 done_so = pytest.mark.parametrize("sign", [torch.tensor(values) for values in DONE.values()], ids=DONE)
 
 
@@ -71,8 +72,9 @@ class Verbs(nn.Module):
         return (rate * x + given,)
 
     @traced
-    def smaller(self, done, values, others):
-        return where_rows(done | (values[0] < others[0]).all(-1), values, others)
+    def until(self, done, x, sign):
+        after = x.sqrt() + self.share
+        return (after - x).abs().amax(-1) < 0.8, after, sign
 
     @traced
     def cubed(self, x):
@@ -97,25 +99,18 @@ class Verbs(nn.Module):
     def chunked(self, x, sign):
         return chunked(2, self.second, [x, sign])[0]
 
-    def stacked(self, x, sign):
-        found = stacked(lambda start, given: self.grown(*start, given.x, 2.0), [self.first(x), (x,)], Pair(x, sign))
-        return self.grown(found[0][0], found[1][0], 1.0)[0]
-
     def in_inference_mode(self, x, sign):
         return in_inference_mode(lambda x: Pair(self.cubed(x), self.cubed(x)), x).sign
 
     def where_rows(self, x, sign):
         return self.selected(x, sign)[0]
 
-    def retry_rows(self, x, sign):
-        return retry_rows(self.is_done(sign), self.first(x), self.second, (x, sign))[0]
-
-    def retry_and_choose(self, x, sign):
-        return retry_rows(self.is_done(sign), self.first(x), self.second, (x, sign), self.smaller)[0]
+    def repeat_rows(self, x, sign):
+        return repeat_rows(self.until, 3, (self.is_done(sign), x, sign), ())[1]
 
 
 class Watched(Verbs):
-    """Keeps of how many rows the second was asked for."""
+    """Keeps how many rows every call was given."""
 
     def __init__(self):
         super().__init__()
@@ -125,31 +120,34 @@ class Watched(Verbs):
         self.asked.append(len(x))
         return super().second(x, sign)
 
+    def until(self, done, x, sign):
+        self.asked.append(len(x))
+        return super().until(done, x, sign)
+
 
 def expected(verb, sign):
     """In closed form."""
     done, first, second = (sign > 0)[:, None], X * torch.tensor([0.5, 0.25]), X.sqrt() + sign[:, None]
-    grown = X * (1 + 2 * X)
+    repeated = [X]
+    for _ in range(3):
+        repeated.append(repeated[-1].sqrt() + torch.tensor([0.5, 0.25]))
+    steps = [0 if sign[row] > 0 else STEPS[row] for row in range(len(X))]
     return {
         "traced": first,
         "onnx_function": X**3 + (X + 1) ** 3,
         "fori_loop": 2 * (0.25 * (0.5 * X + X) + X) + X,
         "cond": first if done.all() else second,
         "chunked": second,
-        "stacked": first * (1 + 2 * X) * (1 + grown),
         "in_inference_mode": X**3 + (X + 1) ** 3,
         "where_rows": torch.where(done, X, -X),
-        "retry_rows": torch.where(done, first, second),
-        "retry_and_choose": torch.where(done | (first < second).all(-1, keepdim=True), first, second),
+        "repeat_rows": torch.stack([repeated[count][row] for row, count in enumerate(steps)]),
     }[verb]
 
 
 VERBS = [name for name, value in vars(control_flow).items() if isfunction(value) and value.__module__ == control_flow.__name__]
 APART = {"can_sync", "writing"}
 """Functions that give no tensors."""
-every_verb = pytest.mark.parametrize(
-    "verb", ["retry_and_choose", *(name for name in VERBS if name not in APART and not name.startswith("_"))]
-)
+every_verb = pytest.mark.parametrize("verb", [name for name in VERBS if name not in APART and not name.startswith("_")])
 
 
 def exported(function, *inputs):
@@ -218,37 +216,52 @@ def test_on_a_gpu_and_compiled_there(verb):
 def test_in_a_recorded_graph_of_a_gpu(sign):
     verbs, x, given = Verbs().to("cuda"), X.to("cuda"), sign.to("cuda")
     with torch.no_grad():
-        verbs.retry_rows(x, given)
+        verbs.repeat_rows(x, given)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
-            found = verbs.retry_rows(x, given)
+            found = verbs.repeat_rows(x, given)
         graph.replay()
-    torch.testing.assert_close(found.cpu(), expected("retry_rows", sign))
+    torch.testing.assert_close(found.cpu(), expected("repeat_rows", sign))
 
 
 @pytest.mark.parametrize("way", [lambda f: f, lambda f: torch.compile(f, fullgraph=True, backend="eager")])
 @done_so
 def test_gradients_come_from_what_was_taken(way, sign):
-    """Of the other in no part: the root of zero in a row that is done has none."""
+    """Of steps that were not taken in no part."""
     torch.compiler.reset()
-    x = torch.where((sign > 0)[:, None], 0.0, X).requires_grad_()
-    (found,) = torch.autograd.grad(way(Verbs().retry_rows)(x, sign).sum(), x)
-    wanted = torch.where((sign > 0)[:, None], torch.tensor([0.5, 0.25]), 0.5 * X.rsqrt())
-    torch.testing.assert_close(found, wanted)
+    x = X.clone().requires_grad_()
+    (found,) = torch.autograd.grad(way(Verbs().repeat_rows)(x, sign).sum(), x)
+    at, by_closed_form = X.clone().requires_grad_(), []
+    for row, count in enumerate(STEPS):
+        value = at[row]
+        for _ in range(0 if sign[row] > 0 else count):
+            value = value.sqrt() + torch.tensor([0.5, 0.25])
+        by_closed_form.append(value)
+    torch.testing.assert_close(found, torch.autograd.grad(torch.stack(by_closed_form).sum(), at)[0])
 
 
 @done_so
-def test_eagerly_only_rows_that_are_not_done_are_computed_again(sign):
+def test_eagerly_only_rows_that_are_not_done_take_a_step(sign):
     verbs = Watched()
-    verbs.retry_rows(X, sign)
-    assert verbs.asked == [count for count in [int((sign <= 0).sum())] if count]
+    verbs.repeat_rows(X, sign)
+    left = [sum(1 for row in range(len(X)) if sign[row] <= 0 and STEPS[row] > step) for step in range(3)]
+    assert verbs.asked == [count for count in left if count]
+
+
+def test_no_more_steps_are_taken_than_asked_for():
+    """Of rows that are never done."""
+    verbs, none = Watched(), torch.zeros(3, dtype=torch.bool)
+    never = lambda done, x, sign: (done, *verbs.until(done, x, sign)[1:])  # noqa: E731
+    assert torch.equal(repeat_rows(never, 0, (none, X, X[:, 0]), ())[1], X)
+    repeat_rows(never, 5, (none, X, X[:, 0]), ())
+    assert verbs.asked == 5 * [3]
 
 
 def test_values_can_be_read_but_in_a_graph_and_on_the_meta_device():
     assert can_sync(X) and not can_sync(X.to("meta"))
     assert torch.compile(lambda x: x + can_sync(x), backend="eager")(X)[0, 0] == X[0, 0]
     verbs = Verbs().to("meta")
-    for verb in ("cond", "retry_rows", "chunked"):
+    for verb in ("cond", "repeat_rows", "chunked"):
         assert getattr(verbs, verb)(X.to("meta"), X[:, 0].to("meta")).shape == X.shape
 
 

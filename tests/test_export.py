@@ -55,9 +55,9 @@ def tracking(case):
 
 @pytest.fixture(scope="module")
 def reconstructor(small_sensor, case):
-    """With a coarser grid, which only finer ones than this would have; so coarse the default does not settle beside lost
-    markers. The sheet full of gas is so slack that it is solved in double precision."""
-    settings, sensor = ForceBalanceSettings(coarsest=5, fine_steps=24), Sensor.from_file(small_sensor / "sensor.toml")
+    """With a coarser grid, which only finer ones than this would have. The sheet full of gas is so slack that it is solved in
+    double precision."""
+    settings, sensor = ForceBalanceSettings(coarsest=5), Sensor.from_file(small_sensor / "sensor.toml")
     if case[0] == "gas":
         sensor = replace(sensor, material=replace(sensor.material, prestretch=1.1), cavity=Cavity("gas", 1013.0))
     made = Reconstructor(sensor, settings=settings)

@@ -20,7 +20,7 @@ from torchmembrane.simulate.dataset import stroke_to
 
 pytestmark = pytest.mark.full  # an export of two views takes some 90 s of processor time, opening its session 25
 
-SETTINGS = tm.ForceBalanceSettings(steps=5, retry_steps_factor=1)
+SETTINGS = tm.ForceBalanceSettings(steps=(5, 5, 5))
 
 
 @pytest.fixture(scope="module")

@@ -110,8 +110,8 @@ def test_wrong_words_are_refused(sensor):
             tm.Reconstructor(sensor, **wrong)
     with pytest.raises(tm.MembraneError, match="expected one of"):
         tm.PaperSettings(flow="cubic")
-    with pytest.raises(tm.MembraneError, match="steps = 1; expected at least 2"):
-        tm.ForceBalanceSettings(steps=1)
+    with pytest.raises(tm.MembraneError, match="steps = 8; expected three numbers of at least 2"):
+        tm.ForceBalanceSettings(steps=8)
 
 
 def test_half_precision_images_are_taken_and_half_precision_modules_are_not(sensor, photographs, result):
@@ -253,9 +253,9 @@ def test_rezero_nulls_what_has_drifted_since_the_rest_image(sensor):
 
 
 def test_names_before_this_version_are_accepted():
-    old, new = dict(patience=2, decline=0.5), dict(retry_steps_factor=2, gnc_fraction=0.5)
+    old, new = dict(settled_step=1e-6, misfit_of_press=3.0), dict(settled_step_tol=1e-6, misfit_per_displacement=3.0)
     assert tm.ForceBalanceSettings(**old) == tm.ForceBalanceSettings(**new) != tm.ForceBalanceSettings()
-    assert replace(tm.ForceBalanceSettings(**new), patience=3).retry_steps_factor == 3
+    assert replace(tm.ForceBalanceSettings(**new), settled_step=1e-5).settled_step_tol == 1e-5
     assert set(OLD_NAMES.values()) < {field.name for field in fields(tm.ForceBalanceSettings)}
     membrane = tm.preset("fingertip").membrane
     assert torch.equal(tm.Surface.of(membrane).membrane(membrane.grid).rest, membrane.rest)

@@ -40,13 +40,15 @@ def test_a_slack_sheet_is_solved_in_double_precision(slack, small_sensor, small_
 
 
 def test_called_float_it_is_solved_in_single_precision(slack, small_images):
+    """A flat plate's press moves by a tenth: with so little stretch, it has several solutions that are about as good."""
     made = Reconstructor(slack)
     expected = made(made.read(*small_images))
     single = made.float()
     assert precisions(single) == {torch.float32}
     result = single(single.read(*small_images))
     assert (result.status == 0).all() and result.vertices.dtype == torch.float32
-    assert (result.vertices - expected.vertices).norm(dim=-1).max() < 0.1 * expected.displacement.norm(dim=-1).max()
+    off = (result.vertices - expected.vertices).flatten(1).norm(dim=1) / expected.displacement.flatten(1).norm(dim=1)
+    assert off.median() < 0.02 and off.max() < 0.15
 
 
 def test_it_is_what_a_module_in_double_precision_finds(slack, small_images):

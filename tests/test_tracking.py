@@ -32,12 +32,11 @@ def stream():
 
 
 def test_a_frame_followed_is_what_it_is_alone_to_the_last_digit(stream, monkeypatch):
-    """Through frames that are searched for alone, and through second tries, which make much of a rounding."""
+    """Through frames that are searched for alone, but followed are not."""
     reconstructor, images = stream
-    estimator, matcher, tracker = reconstructor.estimator, reconstructor.observer.locator.match, tm.Tracker(reconstructor)
-    work, search, retry = [], matcher.search, estimator._retry
+    matcher, tracker = reconstructor.observer.locator.match, tm.Tracker(reconstructor)
+    work, search = [], matcher.search
     monkeypatch.setattr(matcher, "search", lambda *given: work.append("search") or search(*given))
-    monkeypatch.setattr(estimator, "_retry", lambda *given: work.append("second try") or retry(*given))
     seen = set()
     for image in images:
         work.clear()
@@ -49,4 +48,4 @@ def test_a_frame_followed_is_what_it_is_alone_to_the_last_digit(stream, monkeypa
         assert alone.status.tolist() in ([0], [9])
         for name, value in alone._asdict().items():
             assert torch.equal(value.nan_to_num(), getattr(followed, name).nan_to_num()), name
-    assert (("second try",), ("search", "second try")) in seen
+    assert ((), ("search",)) in seen

@@ -11,7 +11,7 @@ tensor (`can_sync`), both sides of a branch are, and the result is selected from
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial, wraps
+from functools import wraps
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 import torch
@@ -37,6 +37,10 @@ class Graph(Protocol):
         self, step: Callable[..., Any], rows: Sequence[tuple[float, ...]], state: Sequence[Any], given: Sequence[Any]
     ) -> Any:
         """Add a loop; arguments as of the function `fori_loop`."""
+        ...
+
+    def repeat_rows(self, step: Callable[..., Any], count: int, state: Sequence[Any], given: Sequence[Any]) -> Any:
+        """Add a loop that ends when all rows are done; arguments as of the function `repeat_rows`."""
         ...
 
     def cond(self, done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Any:
@@ -196,39 +200,6 @@ def chunked(
     return [torch.cat(values) for values in zip(*parts, strict=True)]
 
 
-def stacked(
-    function: Callable[..., Sequence[torch.Tensor]], starts: Sequence[Sequence[Any]], given: Sequence[Any]
-) -> list[Sequence[Any]]:
-    """Return `function(start, given)` for every start.
-
-    The starts are concatenated to one batch, which takes little longer than one start if the tensors are few and small. An
-    exported model computes the starts one after another.
-
-    Args:
-        function: returns tensors `[B, ...]` of which each row depends only on the same row of its arguments.
-        starts: sequences of tensors `[B, ...]`, all equally long.
-        given: a named tuple that all starts share, of tensors `[B, ...]` or None.
-
-    Returns:
-        The function's result for each start.
-
-    Example:
-        >>> from typing import NamedTuple
-        >>> class Rate(NamedTuple):
-        ...     value: torch.Tensor
-        >>> starts = [(torch.tensor([1.0, 2.0]),), (torch.tensor([3.0, 4.0]),)]
-        >>> stacked(lambda start, rate: [start[0] * rate.value], starts, Rate(torch.tensor([1.0, 10.0])))
-        [[tensor([ 1., 20.])], [tensor([ 3., 40.])]]
-    """
-    if _graph((*starts, given)) is not None:
-        return [function(start, given) for start in starts]
-    count = len(starts)
-    together = [torch.cat(values) for values in zip(*starts, strict=True)]
-    for_each = [None if value is None else value.repeat(count, *(1,) * (value.ndim - 1)) for value in given]
-    found = [value.chunk(count) for value in function(together, type(given)(*for_each))]
-    return [list(values) for values in zip(*found, strict=True)]
-
-
 def in_inference_mode(function: Callable[..., Output], *given: Any) -> Output:
     """Return `function(*given)`, computed in inference mode if gradients are disabled.
 
@@ -279,53 +250,46 @@ def where_rows(done: torch.Tensor, values: Sequence[torch.Tensor], others: Seque
     ]
 
 
-def retry_rows(
-    done: Any,
-    values: Sequence[Any],
-    again: Callable[..., Sequence[Any]],
-    given: Sequence[Any],
-    chosen: Callable[..., Any] | None = None,
-) -> Sequence[Any]:
-    """Return `values` in the rows where `done` holds, and the result of `again(*given)` in the others.
+def repeat_rows(step: Callable[..., Sequence[Any]], count: int, state: Sequence[Any], given: Sequence[Any]) -> Sequence[Any]:
+    """Repeat `state = step(*state, *given)` in the rows that are not done, at most `count` times, and return the last state.
 
-    Eagerly, only the rows that are not done are recomputed; on an accelerator this takes one synchronisation, to read `done`.
-    An exported model recomputes all rows if one of them is not done, and a graph in which `done` cannot be read always
-    recomputes all.
+    Eagerly, rows that are done are left out of further steps; on an accelerator every step takes one synchronisation, to read
+    which these are. An exported model contains a Loop that computes all rows and ends when all are done; a graph in which
+    tensors cannot be read takes all steps.
 
     Args:
-        done: `[B]` bool, the rows whose `values` are final.
-        values: tensors `[B, ...]` of the first attempt.
-        again: returns as many tensors of the same shapes, of which each row depends only on the same row of `given`.
-        given: tensors `[B, ...]`, or None, the arguments of `again`.
-        chosen: a `traced` method `chosen(done, values, others)` that selects row by row between the two attempts; it returns
-            `values` where `done` holds. Default: all of `others` are taken.
+        step: a `traced` method that returns the next state.
+        count: largest number of steps.
+        state: tensors `[B, ...]`, initial values of what the steps change; the first says which rows are done, `[B]` bool.
+        given: tensors `[B, ...]`, or None, that the steps only read.
 
     Returns:
-        The tensors. No gradient of `given` passes through `again` in rows that are done.
+        The state. Rows that were done before a step keep their values.
 
     Example:
-        >>> x = torch.tensor([1.0, 2.0])
-        >>> retry_rows(x > 1, [x], lambda x: [10 * x], [x])
-        [tensor([10.,  2.])]
+        >>> x = torch.tensor([1.0, 3.0, 8.0])
+        >>> repeat_rows(lambda done, x: (x > 1.9, 2 * x), 2, (x > 5, x), ())
+        [tensor([True, True, True]), tensor([4., 6., 8.])]
     """
-    chosen = partial(_retried, None) if chosen is None else chosen
-    if _graph(values) is not None:
-        return cond(done, values, lambda: chosen(done, values, again(*given)))
-    if not can_sync(done):
-        unfinished = (None if one is None else where_rows(done, [one.detach()], [one])[0] for one in given)
-        taken: Sequence[Any] = chosen(done, values, again(*unfinished))
-        return taken
-    rows = (~done).nonzero().ravel()
-    if len(rows) == 0:
-        return values
-    others = again(*(None if one is None else one[rows] for one in given))
-    taken = chosen(done[rows], [value[rows] for value in values], others)
-    return [value.index_copy(0, rows, other) for value, other in zip(values, taken, strict=True)]
-
-
-@traced
-def _retried(_: None, done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> Any:
-    return where_rows(done, values, others)
+    graph = _graph(state)
+    if graph is not None:
+        written: Sequence[Any] = graph.repeat_rows(step, count, state, given)
+        return written
+    if not can_sync(state[0]):
+        for _ in range(count):
+            state = where_rows(state[0], state, step(*state, *given))
+        return state
+    whole, here, those, rows = list(state), list(state), list(given), torch.arange(len(state[0]), device=state[0].device)
+    for _ in range(count):
+        left = (~here[0]).nonzero().ravel()
+        if len(left) < len(rows):
+            whole = [value.index_copy(0, rows, part) for value, part in zip(whole, here, strict=True)]
+            here, those = ([None if value is None else value[left] for value in values] for values in (here, those))
+            rows = rows[left]
+        if len(rows) == 0:
+            return whole
+        here = list(step(*here, *those))
+    return [value.index_copy(0, rows, part) for value, part in zip(whole, here, strict=True)]
 
 
 def can_sync(value: torch.Tensor) -> bool:

@@ -12,6 +12,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.marker_residuals import MeasuredRays
 from torchmembrane.estimators.force_balance.robust import Cauchy
+from torchmembrane.estimators.force_balance.schedule import LEAST_MOVE, falling, outlier_scale
 from torchmembrane.solve.stencil import inner, pad_border
 from torchmembrane.surface.topology import corners, triangles_of
 
@@ -47,9 +48,14 @@ class BalanceTwin:
             displacement, pressure = self.coarse(observation)
             still = torch.zeros(1, 4).double()
             u, pressure, _ = e.refined(torch.from_numpy(displacement)[None], torch.tensor([pressure]).double(), still)
-        self.weights = None
-        for tau, outlier in e.schedule():
-            u, pressure = self.step(u, pressure, measured, tau, outlier)
+        tau, last = (e.settings.tau[0] if self.coarse is None else e.settings.fine_tau), e.settings.tau[1]
+        for _ in range(e.steps):
+            before = u
+            u, pressure = self.step(u, pressure, measured, tau, outlier_scale(e.gauss_newton.settings.outlier, tau / last))
+            moved = float((u - before).square().sum(-1).mean().sqrt()) / e.size
+            if tau <= last and moved <= e.settings.settled_step_tol:
+                break
+            tau = max(last, tau * falling(max(moved, LEAST_MOVE)))
         return u[0].numpy(), float(pressure)
 
     def step(self, u: torch.Tensor, pressure, measured: MeasuredRays, tau: float, outlier: float):
@@ -58,8 +64,7 @@ class BalanceTwin:
         forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss
         force, normals = forces(u, pressure), e.membrane.normals(x)
         within = (inner(field, e.membrane.grid).mT for field in (normals, force))
-        memory = None if self.weights is None else (self.weights, e.settings.renewal)
-        inner_weights, self.weights = loss.weights(*within, measured.noise_level, tau, memory=memory)
+        inner_weights = loss.weights(*within, measured.noise_level, torch.full_like(measured.noise_level, tau))
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
         angle, jacobian = bearings.angles(u, measured, torch.zeros(1, 4).double())

@@ -4,9 +4,9 @@ python -m bench.speed.gpu [--device cuda] [--sensor FILE] [--images FILES] [--ba
     [--compiled] [--json FILE]
 
 Wall time, the device waited for, the median of `--repeats` calls, over the batch. Kernels are those of one call (on the CPU,
-for a try without a GPU, the operators). --graph: images to results recorded once as a CUDA graph and replayed, in which the
-second tries of all frames are computed; --compiled: `torch.compile` of the same, minutes to compile. The first batch that does
-not fit ends the table.
+for a try without a GPU, the operators). --graph: images to results recorded once as a CUDA graph and replayed, in which all
+frames take all steps; --compiled: `torch.compile` of the same, minutes to compile. The first batch that does not fit ends the
+table.
 """
 
 import argparse

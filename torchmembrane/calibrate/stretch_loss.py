@@ -14,7 +14,7 @@ from ..estimators.force_balance.estimator import ForceBalance
 from ..estimators.force_balance.gauss_newton import State
 from ..progress import Progress, silent
 
-STEPS = 4  # of Gauss-Newton from a neighbour's solution
+STEPS = 8  # largest number of Gauss-Newton steps from a neighbour's solution
 
 Explained = tuple[ForceBalance, Equilibrium]
 
@@ -41,7 +41,7 @@ def _better(own: Explained, neighbour: Explained, observation: Observation) -> E
     )
     state: State
     with torch.no_grad():
-        state, before = estimator.gauss_newton(start, measured, estimator.schedule()[-1:] * STEPS)
+        state, before = estimator.gauss_newton(start, measured, estimator.settings.tau[-1], STEPS)
         tried = estimator.equilibrium(*state, before, measured)
     lower = estimator.is_converged(tried) & (tried.objective < found.objective)
     rows = (torch.where(lower.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(tried, found, strict=True))

@@ -6,6 +6,7 @@ are assembled into one graph.
 
 import json
 from collections.abc import Callable, Sequence
+from functools import cache, wraps
 from hashlib import sha256
 from inspect import unwrap
 from pathlib import Path
@@ -19,7 +20,7 @@ from onnx import TensorProto, helper
 from torch import Tensor, nn
 
 from .. import __version__
-from ..control_flow import FUNCTIONS, Value
+from ..control_flow import FUNCTIONS, Value, where_rows
 from ..errors import MembraneError, check_arguments
 from ..files.atomic import write_bytes
 from ..progress import Progress, silent, within
@@ -96,6 +97,14 @@ class Tracer:
         names = {name: here for name, here in names.items() if name not in tables}
         return self._known(found, self.assembly.loop(model, names, len(rows), tables))
 
+    def repeat_rows(self, step: Callable[..., Any], count: int, state: Sequence[Any], given: Sequence[Any]) -> Any:
+        """Append a loop over a bound method that ends when all rows are done; see `control_flow.repeat_rows`."""
+        assert isinstance(step, MethodType) and isinstance(step.__self__, nn.Module)
+        going = self.call(None, _somewhere_left, (state[0],))
+        masked = _masked(unwrap(step.__func__), len(state))
+        model, names, found = self._trace(step.__self__, masked, [*state, *given])
+        return self._known(found[:-1], self.assembly.loop(model, names, count, {}, going.name))
+
     def cond(self, done: Known, values: Sequence[Known], otherwise: Callable[[], Sequence[Known]]) -> Sequence[Known]:
         """Append a conditional and return the chosen values; see `control_flow.cond`."""
         condition = self.call(None, _everywhere, (done,))
@@ -161,6 +170,24 @@ def _everywhere(_: None, done: Tensor) -> Tensor:
     return done.all()
 
 
+def _somewhere_left(_: None, done: Tensor) -> Tensor:
+    return torch.logical_not(done.all())
+
+
+@cache
+def _masked(step: Callable[..., Any], count: int) -> Callable[..., Any]:
+    """Return a method that takes a step of `repeat_rows` with a state of `count` tensors in the rows that are not done, and
+    says whether any row is left."""
+
+    @wraps(step)
+    def masked(owner: nn.Module, *values: Any) -> list[Tensor]:
+        before, (now_done, *after) = values[1:count], step(owner, *values)
+        done = values[0] | now_done  # onnxruntime has no Where for bools
+        return [done, *where_rows(values[0], before, after), _somewhere_left(None, done)]
+
+    return masked
+
+
 def _kind(example: Tensor) -> int:
     """Return the ONNX code of a tensor's element type."""
     return helper.np_dtype_to_tensor_dtype(example.numpy().dtype)
@@ -214,7 +241,7 @@ def export(
         rest = reconstructor.rest_pixels
         before.append(tracer.given(PREVIOUS, rest.expand(EXAMPLES, *rest.shape).contiguous()))
     inputs, values = images + before, cast(Any, images)  # they stand for tensors
-    with EXPORTER.at_work():
+    with EXPORTER.at_work(), torch.no_grad():
         given = [reconstructor.observer.sighted(pixels) for pixels in cast(Any, before)]
         result: Any = reconstructor.reconstruct_grey(values[0] if len(values) == 1 else values, *given)
     model = _finished(tracer, inputs, result, reconstructor)

@@ -122,19 +122,30 @@ class Assembly:
         """Give a value the name `output`."""
         self.nodes.append(helper.make_node("Identity", [name], [output]))
 
-    def loop(self, piece: onnx.ModelProto, names: dict[str, str], steps: int, tables: dict[str, np.ndarray]) -> dict[str, str]:
+    def loop(
+        self,
+        piece: onnx.ModelProto,
+        names: dict[str, str],
+        steps: int,
+        tables: dict[str, np.ndarray],
+        going: str | None = None,
+    ) -> dict[str, str]:
         """Add a Loop over a piece whose outputs, in order, are the next values of its first inputs.
 
-        For further inputs, `tables` has a row for every step; inputs that are not in `tables` keep their value.
+        For further inputs, `tables` has a row for every step; inputs that are not in `tables` keep their value. If `going` is
+        given, the name of a bool in this graph, steps are taken only while it is true, and the piece has one more output, its
+        next value.
         """
-        k, count = f"{self.part}/{self.pieces}", len(piece.graph.output)
+        k, count = f"{self.part}/{self.pieces}", len(piece.graph.output) - (going is not None)
         state = [value.name for value in piece.graph.input][:count]
         inside = {name: f"{k}/{name}" for name in [*state, *tables]}
         nodes, outputs = self._renamed(piece, names | inside)
         rows = [
             helper.make_node("Gather", [self.constant(table), f"{k}/step"], [inside[name]]) for name, table in tables.items()
         ]
-        go_on = helper.make_node("Identity", [f"{k}/on"], [f"{k}/still"])
+        *_, last_output = outputs
+        next_going = f"{k}/on" if going is None else outputs.pop(last_output)
+        go_on = helper.make_node("Identity", [next_going], [f"{k}/still"])
         kinds = {value.name: value.type.tensor_type.elem_type for value in piece.graph.input}
         counter = [described(f"{k}/step", TensorProto.INT64, []), described(f"{k}/on", TensorProto.BOOL, [])]
         entering = [described(inside[name], kinds[name]) for name in state]
@@ -142,7 +153,7 @@ class Assembly:
         still = described(f"{k}/still", TensorProto.BOOL, [])
         body = helper.make_graph([*rows, *nodes, go_on], "step", [*counter, *entering], [still, *leaving])
         last = {name: f"{here}/last" for name, here in outputs.items()}
-        trips = [self.constant(np.array(steps)), self.constant(np.array(True))]
+        trips = [self.constant(np.array(steps)), going or self.constant(np.array(True))]
         self.nodes.append(helper.make_node("Loop", [*trips, *(names[name] for name in state)], list(last.values()), body=body))
         return last
 

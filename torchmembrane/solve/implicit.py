@@ -1,4 +1,8 @@
-"""Implicit differentiation of solutions of symmetric systems: `dx = A^-1 (db - dA x)`, without differentiating the solver."""
+"""Implicit differentiation: gradients of solutions without differentiating the solver.
+
+A x = b, symmetric   dx = A^-1 (db - dA x)              `differentiable`
+x = T(x)             dx = (1 - dT/dx)^-1 dT             `differentiable_fixed_point`
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,8 +11,13 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from .anderson import accelerated, first
 
 Linear = Callable[[Tensor], Tensor]
+ADJOINT_STEPS = 24
+"""Number of products with the transpose of `dT/dx` in the gradient of a fixed point."""
+UNROLLED_STEPS = 8
+"""Number of steps whose gradient a compiled graph takes instead, which cannot differentiate within its backward pass."""
 
 
 def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
@@ -37,6 +46,61 @@ def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
         x = solve(b)
     solution: Tensor = _Solution.apply(b - apply(x), x, solve)
     return solution
+
+
+def differentiable_fixed_point(step: Linear, x: Tensor) -> Tensor:
+    """Return `x = step(x)` with the gradients of the exact fixed point.
+
+    Backpropagation solves `y = g + (d step / dx)^T y` for the gradient `g` of `x`, by Anderson's method, and passes `y` through
+    one step to everything that the step depends on. A compiled graph takes the gradient of `UNROLLED_STEPS` steps instead,
+    which is the same where so many steps converge.
+
+    Args:
+        step: a step of the fixed-point iteration, `[B, N]` to `[B, N]`, row by row.
+        x: the fixed point, `[B, N]`; what it was computed from is not differentiated.
+
+    Limitations:
+        As for `differentiable`. They are the gradients of the fixed point as far as `x` has converged to it.
+
+    Example:
+        >>> a = torch.tensor(0.5, requires_grad=True)
+        >>> differentiable_fixed_point(lambda x: a * x + 1, torch.tensor([[2.0]])).sum().backward()
+        >>> a.grad  # of 1 / (1 - a)
+        tensor(4.)
+    """
+    x = x.detach()
+    if torch.compiler.is_compiling():
+        after = x
+        for _ in range(UNROLLED_STEPS):
+            after = step(after)
+        return x + (after - after.detach())
+    fixed: Tensor = _FixedPoint.apply(step(x), x, step)
+    return fixed
+
+
+class _FixedPoint(torch.autograd.Function):
+    """Identity function of `x` whose gradients are those of the fixed point of `step`."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(after: Tensor, x: Tensor, step: Linear) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Linear], output: Tensor) -> None:
+        after, x, ctx.step = inputs
+        ctx.save_for_backward(after, x)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        after, x = ctx.saved_tensors
+        with torch.enable_grad():
+            _, transposed = torch.func.vjp(ctx.step, x)
+            y, *history = first(gradient, transposed(gradient)[0])
+            for _ in range(ADJOINT_STEPS - 1):
+                y, *history = accelerated(y, gradient + transposed(y)[0] - y, *history)
+        return _Once.apply(y.detach(), gradient, after), None, None
 
 
 class _Solution(torch.autograd.Function):

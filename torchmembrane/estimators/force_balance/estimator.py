@@ -16,7 +16,7 @@ radius `reach`, and the weights of the steps are evaluated at `S_k` instead of `
 
 The solver is iteratively reweighted least squares (IRLS) with Gauss-Newton steps, while `tau` decreases from where all losses
 are quadratic (graduated non-convexity, GNC), starting from the rest surface. A fine grid starts from the solution on every
-second line, with an `InitialGuess` in the contacts. Frames that have not settled are solved again from several starts.
+second line, with an `InitialGuess` in the contacts. Every frame lowers `tau` at its own speed (`schedule`).
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from ...control_flow import retry_rows, traced, where_rows
+from ...control_flow import traced
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
 from ...solve.stencil import pad_border
@@ -43,14 +43,11 @@ from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
 from .starts import InitialGuess
-from .traction_loss import TractionLoss, is_significant
+from .traction_loss import TractionLoss
 from .uncertainty import depths, gap_around, noise_effects, of_presses, shares_of_deepest, spreads, standard_deviations
 
 MIN_RESOLVED_LINES = 17
 """Lines of a grid with a discretisation error below the markers' noise; on coarser ones it grows as the square of the step."""
-
-SINGLE_GRID_SETTLING_STEPS = 3
-"""Number of last steps that are damped to make the solution settle, if there is only one grid."""
 
 
 class ForceBalance(Estimator):
@@ -70,7 +67,6 @@ class ForceBalance(Estimator):
         settings: all other settings.
         rest: the markers' rays at rest with their noise; None: rays from the origin, with `noise`.
         views: number of views that see the markers, which are listed once for each view.
-        is_coarse: whether a finer grid follows.
         levers: vectors from the markers to their visible tips at rest, `[D, 3]`; None: the markers lie on the surface.
 
     Limitations:
@@ -97,7 +93,6 @@ class ForceBalance(Estimator):
         settings: ForceBalanceSettings | None = None,
         rest: Observation | None = None,
         views: int = 1,
-        is_coarse: bool = False,
         levers: Tensor | None = None,
     ):
         settings, spacing = settings or ForceBalanceSettings(), membrane.size / (len(positions) // views) ** 0.5
@@ -109,14 +104,12 @@ class ForceBalance(Estimator):
         bearings = residuals_of(membrane, markers, positions, noise, rest, views, levers)
         self.coarse = self._coarser(elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views, levers=levers)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
-        cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
-        loss = TractionLoss(membrane, self.reference, cone, settings)
+        loss = TractionLoss(membrane, self.reference, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
         self.gauss_newton = GaussNewton(self.equations, self.cavity, settings)
         self.dent = InitialGuess(self.gauss_newton) if self.coarse is not None and self.coarse.coarse is None else None
-        self.settling = 1 if is_coarse or self.coarse is not None else SINGLE_GRID_SETTLING_STEPS
-        first = settings.coarse_steps if is_coarse else settings.steps
-        self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
+        self.steps = settings.steps[0 if self.coarse is None else 2 if self.dent is None else 1]
+        self._first_tau = settings.tau[0] if self.coarse is None else settings.fine_tau
         rest = seen_from_origin(bearings.seen_at_rest) if rest is None else rest
         loss.push_noise, loss.noise_gain = noise_effects(self.equations, self.cavity, rest, settings.camera_motion)
 
@@ -136,7 +129,7 @@ class ForceBalance(Estimator):
         markers, material = every_second.closest_points(positions.numpy()), elasticity.for_membrane(every_second)
         given = every_second, material, markers, positions, bearings.noise
         settings = replace(self.settings, outlier=self.settings.coarse_outlier)
-        return type(self)(*given, settings=settings, is_coarse=True, **others)
+        return type(self)(*given, settings=settings, **others)
 
     @property
     def must_compile(self) -> bool:
@@ -148,11 +141,6 @@ class ForceBalance(Estimator):
     def solves_in_double(self) -> bool:
         """Whether the sheet is too slack to be solved in single precision."""
         return self.equations.is_slack
-
-    @property
-    def dents(self) -> InitialGuess | None:
-        """The initial guesses of this grid or of a coarser one."""
-        return self.coarse.dents if self.dent is None and self.coarse is not None else self.dent
 
     @property
     def elasticity(self) -> ElasticEnergy:
@@ -186,59 +174,24 @@ class ForceBalance(Estimator):
     def forward(self, observation: Observation) -> Equilibrium:
         """Reconstruct the surface from the markers' rays."""
         measured = self.equations.bearings.measured(observation)
-        found = self._solved(measured)
-        return Equilibrium(*retry_rows(self.is_done(found, measured), found, self._retry, measured, self.chosen))
+        with torch.no_grad():
+            state, before = self._solve_on_grid(measured)
+        return self.equilibrium(*self.gauss_newton.with_gradients(state, measured), before, measured)
 
-    def _retry(self, *measured: Any) -> Equilibrium:
-        """Solve again in many small steps, which deep presses need."""
-        return self._solved(MeasuredRays(*measured), is_retry=True)
-
-    @traced
-    def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
-        """Return `values` where they are `done [B]`, or converged and not clearly worse, or `others` are NaN; else `others`."""
-        first, second = Equilibrium(*values), Equilibrium(*others)
-        is_worse = second.objective > self.settings.retry_acceptance_ratio * first.objective
-        stands = self.is_converged(first) & self.is_explained(first) & is_worse
-        return Equilibrium(*where_rows(done | stands | second.objective.isnan(), first, second))
-
-    def _solved(self, measured: MeasuredRays, is_retry: bool = False) -> Equilibrium:
-        state, before = self._solve_on_grid(measured, is_retry)
-        return self.equilibrium(*state, before, measured)
-
-    def _solve_on_grid(self, measured: MeasuredRays, is_retry: bool) -> tuple[State, Tensor]:
+    def _solve_on_grid(self, measured: MeasuredRays) -> tuple[State, Tensor]:
         """Return the state after the steps on the coarser grids and this one, and the displacement before the last step."""
-        schedule = self.schedule(is_retry)
-        last = schedule[-1:] * len(schedule)
-        found: tuple[State, Tensor]
-        if self.dent is None:
-            settling, damping = self.settling, self.settings.settling_damping
-            if is_retry and self.coarse is not None:
-                settling, damping = self.settings.settling_steps, self.settings.retry_damping
-            found = self.gauss_newton(self._begun(measured, is_retry), measured, schedule, settling=settling, damping=damping)
-        elif is_retry:
-            found = self.dent.best_of_starts(self._undented(measured, is_retry), measured, last)
-        else:
-            found = self.gauss_newton(self.dent(*self._undented(measured), measured), measured, last)
+        found: tuple[State, Tensor] = self.gauss_newton(self._begun(measured), measured, self._first_tau, self.steps)
         return found
 
-    def _begun(self, measured: MeasuredRays, is_retry: bool) -> State:
-        """Return the solution of the coarser grid on this one, or the rest state if there is no coarser grid."""
+    def _begun(self, measured: MeasuredRays) -> State:
+        """Return the rest state on the coarsest grid, and on any other the solution of the coarser one; on the second coarsest
+        with a dent where a first step finds pushes."""
         if self.coarse is None:
             return self.at_rest(measured.weight)
-        return State(*self.refined(*self.coarse._solve_on_grid(measured, is_retry)[0]))
-
-    def _undented(self, measured: MeasuredRays, is_retry: bool = False) -> State:
-        """Return the state after a first step, whose pushes determine where it is dented."""
-        return State(*self.gauss_newton(self._begun(measured, is_retry), measured, self.schedule(is_retry)[:1])[0])
-
-    def schedule(self, is_retry: bool = False) -> list[tuple[float, float]]:
-        """Return `tau` and `R` of every step on this grid, in a first or second try."""
-        settings = self.settings
-        steps = settings.retry_steps_factor * self.steps if is_retry else self.steps
-        if self.coarse is not None and self.dent is None:
-            return [(settings.fine_tau[-1], settings.outlier)] * (steps + is_retry * settings.settling_steps)
-        coarsest, fine = (settings.retry_tau, settings.retry_fine_tau) if is_retry else (settings.tau, settings.fine_tau)
-        return settings.gnc_schedule(steps, coarsest if self.coarse is None else fine)
+        state = State(*self.refined(*self.coarse._solve_on_grid(measured)[0]))
+        if self.dent is None:
+            return state
+        return State(*self.dent(*self.gauss_newton(state, measured, self._first_tau, 1)[0], measured))
 
     @traced
     def at_rest(self, confidence: Tensor) -> State:
@@ -288,22 +241,6 @@ class ForceBalance(Estimator):
         """Return where the last step was short and the volume fulfils the cavity's law, `[B]` bool."""
         error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
         return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
-
-    @traced
-    def is_settled(self, found: Equilibrium) -> Tensor:
-        """Return where the solution is converged and explained, so that more steps would change little, `[B]` bool."""
-        return (found.relative_step < self.settings.settled_step_tol) & self.is_converged(found) & self.is_explained(found)
-
-    @traced
-    def is_done(self, found: Equilibrium, measured: MeasuredRays) -> Tensor:
-        """Return where the solution is settled, plausible, not a mound in place of a dent, and has few outliers, `[B]` bool."""
-        settings, (least, most, untouched) = self.settings, self.settings.likely_objective
-        outlying = self.equations.bearings.outlying(found.vertices - self.membrane.rest, measured, found.moved, self._far)
-        likely = (least + settings.likely_per_displacement * self._press(found)).clamp_max(most)
-        pushed = (is_significant(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
-        likely = torch.where(pushed, likely, untouched) * self.coarseness**2
-        done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlier_share)
-        return done if self.dents is None else done & ~self.dents.is_ring_shaped(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """Return where a surface of this sensor explains the markers, `[B]` bool: misfit, misfit shared by neighbours, tension

@@ -1,6 +1,5 @@
 """Gauss-Newton steps of force balance in surface, pressure and camera motion, with linearised volume."""
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,10 +7,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...control_flow import chunked, fori_loop, traced, where_rows
+from ...control_flow import chunked, repeat_rows, traced, where_rows
 from ...machine_code import takes
 from ...mechanics.cavity import CavityLaw
-from ...solve.implicit import differentiable
+from ...solve.implicit import differentiable, differentiable_fixed_point
 from ...solve.kkt import border_unknowns
 from ...solve.stencil import inner
 from .kernels.steps import NativeSteps
@@ -19,6 +18,7 @@ from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
+from .schedule import LEAST_MOVE, falling, outlier_scale, settling_of
 from .settings import ForceBalanceSettings
 from .traction_loss import LossTerms
 
@@ -41,26 +41,8 @@ class State(NamedTuple):
     moved: Tensor
 
 
-class Scales(NamedTuple):
-    """Parameters of a step, `[]` each.
-
-    Attributes:
-        tau: scale of the loss of compressive traction.
-        outlier: scale of the markers' loss.
-        cone: as for `TractionLoss.weights`.
-        renewal: as in the memory of `TractionLoss.weights`.
-        damping: relative increase of the matrix's diagonal.
-    """
-
-    tau: Tensor
-    outlier: Tensor
-    cone: Tensor
-    renewal: Tensor
-    damping: Tensor
-
-
 class GaussNewton(nn.Module):
-    """Iteratively reweighted Gauss-Newton steps with a schedule of the losses' scales.
+    """Iteratively reweighted Gauss-Newton steps, in which every frame lowers the losses' scales at its own speed.
 
     Args:
         equations: linearised and weighted equations of force balance.
@@ -75,78 +57,58 @@ class GaussNewton(nn.Module):
         self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
         self.native, self._given = NativeSteps(), (equations, cavity)
 
-    def forward(
-        self,
-        state: State,
-        measured: MeasuredRays,
-        schedule: list[tuple[float, float]],
-        settling: int = 1,
-        damping: float | None = None,
-    ) -> tuple[State, Tensor]:
-        """Return the state after the steps of a schedule, and the displacement before the last step.
+    def forward(self, state: State, measured: MeasuredRays, tau: float, steps: int) -> tuple[State, Tensor]:
+        """Return the state in which each frame has settled, and the displacement before the last step.
+
+        A frame has settled when a step at the last `tau` is shorter than `settled_step_tol`. Frames that have not settled when
+        `SETTLING_STEPS` steps are left take these with more damping, and the state with the lowest objective is kept.
 
         Args:
             state: initial state.
             measured: the markers' rays.
-            schedule: scales of the losses in every step.
-            settling: number of last steps with at least `damping`, so that the solution settles.
-            damping: damping of these steps; default `settling_damping`.
+            tau: first scale of the loss of compressive traction.
+            steps: largest number of steps.
         """
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         if self.is_native(*state, *measured):
             frames = max(frames, torch.get_num_threads())
-        damping = self.settings.settling_damping if damping is None else damping
-        taus, size = [tau for tau, _ in schedule], len(schedule)
-        numbers = [self._numbers(taus[: k + 1], damping if size - k <= settling else 0.0) for k in range(size)]
-        rows = [(*scales, self.equations.loss.cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
-        u, pressure, moved, before = chunked(frames, self._run_chunk, (*state, *measured), rows, settling)
+        u, pressure, moved, before = chunked(frames, self._run_chunk, (*state, *measured), tau, steps)
         return State(u, pressure, moved), before
 
-    def _numbers(self, taus: list[float], least: float) -> tuple[float, float]:
-        """Return the renewal and the damping of a step.
-
-        While the scales decrease, the weights of the step before are not used, because the weights would lag behind.
-
-        Args:
-            taus: scales `tau` of all steps up to this one.
-            least: smallest damping, except in the first step.
-        """
-        settings, (first, last) = self.settings, self.settings.tau
-        *before, tau = taus
-        damping = settings.damping * (min(tau, first) / last) ** 2
-        if before:
-            damping = max(damping, least)
-        return settings.renewal if before[-1:] == [tau] else 1.0, damping
-
-    def _run_chunk(self, u: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the state after the steps, and the displacement before the last; `given` are the rays, the parameters of the
-        steps, and the number of settling steps."""
-        *of_markers, rows, settling = given
-        measured, last = MeasuredRays(*of_markers), rows[-settling:] if settling > 1 else []
-        state: Sequence[Any] = (u, pressure, moved, u, self._unweighted(u))
-        first = rows[: len(rows) - len(last)]
+    def _run_chunk(self, u: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, ...]:
+        """Return the state after the steps, and the displacement before the last; `given` are the rays, the first `tau` and the
+        number of steps."""
+        *of_markers, tau, steps = given
+        state, settling = State(u, pressure, moved), settling_of(steps)
         if self.is_native(*state, *of_markers):
-            state = self.native.take(*self._given, State(u, pressure, moved), state[4], measured, first)
-        else:
-            state = fori_loop(self._next, first, state, measured)
-        if last:
-            state = fori_loop(self._step_keeping_best, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
-        u, pressure, moved, before = state[:4]
-        return u, pressure, moved, before
+            return tuple(self.native.take(*self._given, state, MeasuredRays(*of_markers), tau, steps))
+        found = repeat_rows(self._next, steps - settling, self._begun(*state, tau), of_markers)[:5]
+        if settling:
+            best = self._best_so_far(*found)
+            found = repeat_rows(self._next_keeping_best, settling, (*found, *best), of_markers)[5:]
+        return tuple(found[1:])
+
+    def with_gradients(self, state: State, measured: MeasuredRays) -> State:
+        """Return a state in which all frames have settled, with the gradients of the fixed point of the steps."""
+        if not torch.is_grad_enabled() or self.is_native(*state, *measured):
+            return state
+        sizes = [state.u[0].numel(), 1, state.moved.shape[1]]
+        tau, undamped = (torch.full_like(state.pressure, value) for value in (self.settings.tau[1], 0.0))
+
+        def stepped(unknowns: Tensor) -> Tensor:
+            u, pressure, moved = unknowns.split(sizes, 1)
+            u = u.unflatten(1, (-1, 3)) * self.equations.forces.free  # what no step changes is no unknown
+            p = self.cavity.rest_pressure.expand_as(tau) if self.cavity.filling == "open" else pressure[:, 0]
+            after = self.step(State(u, p, moved), measured, tau, undamped)
+            return torch.cat([after.u.flatten(1), after.pressure[:, None], after.moved], 1)
+
+        unknowns = torch.cat([state.u.flatten(1), state.pressure[:, None], state.moved], 1)
+        u, pressure, moved = differentiable_fixed_point(stepped, unknowns).split(sizes, 1)
+        return State(u.unflatten(1, (-1, 3)), pressure[:, 0], moved)
 
     def is_native(self, *values: Any) -> bool:
         """Return whether machine code takes the steps of these tensors."""
         return self.equations.bearings.in_machine_code and takes(*values, self.equations.forces.elasticity.prestretch)
-
-    @traced
-    def _unweighted(self, u: Tensor) -> Tensor:
-        """Return a placeholder for the weights of a step before the first, `[B, N]`; the first step does not use it."""
-        return torch.ones_like(u[:, : self.equations.loss.area.shape[0], 0])
-
-    @traced
-    def _none_found(self, pressure: Tensor) -> Tensor:
-        """Return the objective of a state that does not exist yet: infinity, `[B]`."""
-        return torch.full_like(pressure, torch.inf)
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: MeasuredRays) -> Tensor:
         """Return the objective of the last steps, `[B]`: the misfit of markers and gauge, and the loss of the tractions."""
@@ -180,86 +142,93 @@ class GaussNewton(nn.Module):
         return traction
 
     @traced
-    def _next(
-        self,
-        u: Tensor,
-        pressure: Tensor,
-        moved: Tensor,
-        before: Tensor,
-        weights: Tensor,
-        measured: MeasuredRays,
-        *scales: float,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Take a step; return the state, the displacement before it, and the weights of normal tractions."""
-        state, weights = self._compiled_step(State(u, pressure, moved), weights, measured, scales)
-        return *state, u, weights
+    def _begun(self, u: Tensor, pressure: Tensor, moved: Tensor, tau: float) -> tuple[Tensor, ...]:
+        """Return the arguments of `_next` that it changes, before its first step."""
+        return torch.zeros_like(pressure, dtype=torch.bool), u, pressure, moved, u, torch.full_like(pressure, tau)
 
     @traced
-    def _step_keeping_best(
-        self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any
+    def _next(
+        self, done: Tensor, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, tau: Tensor, *of_markers: Any
+    ) -> tuple[Tensor, ...]:
+        """Take a step in every frame; return whether it has settled, the state, the displacement before, and the next `tau`."""
+        state = self._compiled_step(State(u, pressure, moved), MeasuredRays(*of_markers), tau, torch.zeros_like(tau))
+        step, last = self._length(u, state.u), self.settings.tau[1]
+        settled = ~((tau > last) | (step > self.settings.settled_step_tol))
+        return settled, *state, u, (tau * falling(step.clamp_min(LEAST_MOVE))).clamp_min(last)
+
+    @traced
+    def _best_so_far(self, done: Tensor, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor) -> tuple[Tensor, ...]:
+        """Return the lowest objective so far, `[B]`, and the state that has it, before the first step of `_next_keeping_best`.
+
+        A frame that is `done` keeps its state, because no objective is lower than minus infinity.
+        """
+        return torch.where(done, -torch.inf, torch.full_like(pressure, torch.inf)), u, pressure, moved, before
+
+    @traced
+    def _next_keeping_best(
+        self, done: Tensor, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, lowest: Tensor, *others: Any
     ) -> list[Tensor]:
-        """Take a step, and keep the state with the lowest objective, with the displacement before it and its objective.
+        """Take a damped step at the last `tau`, and keep the state with the lowest objective.
 
         If a vertex is alternately pushed and pulled, not every step gives a usable solution.
 
         Args:
+            done: whether a frame has settled, `[B]`.
             u: current displacement, `[B, V, 3]`.
             pressure: current pressure, `[B]`.
             moved: current camera motion, `[B, 4 W]`.
             before: displacement before the last step, `[B, V, 3]`.
-            weights: weights of normal tractions, `[B, N]`.
-            given: the best state so far, the measured rays, and the parameters of the step.
+            lowest: lowest objective so far, `[B]`.
+            others: the state that has it, with the displacement before it, and the measured rays.
         """
-        *kept, lowest, measured = given[:6]
-        state, weights = self._compiled_step(State(u, pressure, moved), weights, measured, given[6:])
+        kept, measured = others[:4], MeasuredRays(*others[4:])
+        tau = torch.full_like(pressure, self.settings.tau[1])
+        state = self._compiled_step(
+            State(u, pressure, moved), measured, tau, torch.full_like(tau, self.settings.settling_damping)
+        )
         objective = self.objective(state, *self.tractions(*state[:2]), measured)
-        is_lower = objective < lowest
-        return [*state, u, weights, *where_rows(is_lower, (*state, u, objective), (*kept, lowest))]
+        settled = ~(self._length(u, state.u) > self.settings.settled_step_tol)
+        best = where_rows(objective < lowest, (objective, *state, u), (lowest, *kept))
+        return [settled, *state, u, *best]
 
-    def _compiled_step(
-        self, state: State, weights: Tensor, measured: MeasuredRays, scales: Sequence[float]
-    ) -> tuple[State, Tensor]:
+    def _length(self, u: Tensor, after: Tensor) -> Tensor:
+        """Return the rms displacement of a step, relative to the size, `[B]`."""
+        return (after - u).square().sum(-1).mean(-1).sqrt() / self.membrane.size
+
+    def _compiled_step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> State:
         """Take `step` as a region that `torch.compile` traces and compiles only once; the exporter does the same by itself.
 
         With gradients every step is traced: the gradients of a nested region have strides that torch 2.13 does not handle.
         """
-        if self.is_native(*state, weights, *measured):
-            *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
-            return State(*after), weights
-        numbers = Scales(*(scale if isinstance(scale, Tensor) else state.u.new_full((), scale) for scale in scales))
         if torch.compiler.is_exporting() or torch.is_grad_enabled():
-            return self.step(state, weights, measured, numbers)
-        *after, weights = self._nested_step(state, weights, measured, numbers)
-        return State(*after), weights
+            return self.step(state, measured, tau, damping)
+        return State(*self._nested_step(state, measured, tau, damping))
 
     @torch.compiler.nested_compile_region
-    def _nested_step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[Tensor, ...]:
+    def _nested_step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> tuple[Tensor, ...]:
         """Return the tensors of `step` in a plain tuple: torch 2.13 traces a region that returns named tuples at every call."""
-        after, weights = self.step(state, weights, measured, scales)
-        return *after, weights
+        return tuple(self.step(state, measured, tau, damping))
 
-    def step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
+    def step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> State:
         """Take one reweighted Gauss-Newton step with linearised volume, limiting the longest step of a vertex.
 
         Args:
             state: state before the step.
-            weights: weights of the normal tractions in the step before, `[B, N]`.
             measured: the markers' rays.
-            scales: scales of the losses, and the step's other parameters.
+            tau: scale of the loss of compressive traction, `[B]`, on which the other scales depend.
+            damping: smallest relative increase of the matrix's diagonal, `[B]`.
 
         Returns:
-            The state and the weights after the step.
+            The state after the step.
         """
-        tau, outlier, cone, renewal, damping = scales
-        equations, (u, pressure, moved) = self.equations, state
-        _, normal, loads, corner, motion, weights = equations.linearised(
-            *state, measured, tau, outlier, cone, memory=(weights, renewal)
-        )
-        loads = torch.cat([loads, motion.coupling], 1)
-        first, last = self.settings.tau
+        settings, equations, (u, pressure, moved) = self.settings, self.equations, state
+        first, last = settings.tau
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 at the last tau
-        solved = self._solved(normal, loads, damping)
-        motion = motion.with_prior(moved, self.settings.camera_motion * blunt)
+        outlier = outlier_scale(torch.full_like(tau, settings.outlier), tau / last)
+        _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
+        loads = torch.cat([loads, motion.coupling], 1)
+        solved = self._solved(normal, loads, (settings.damping * blunt).maximum(damping)[:, None, None])
+        motion = motion.with_prior(moved, settings.camera_motion * blunt[:, None])
         products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
         shares = self._shares(u, pressure, products, corner)
@@ -267,7 +236,7 @@ class GaussNewton(nn.Module):
         move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
         share = self._share(u, move)
         u = u + share[:, None, None] * move.flatten(2).mT
-        return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
+        return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn)
 
     def _solved(self, normal: NormalEquations, loads: Tensor, damping: Tensor) -> Tensor:
         """Return the solutions `[B, C, 3 N]` of the damped equations; gradients are those of the exact solution."""

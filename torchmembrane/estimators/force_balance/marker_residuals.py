@@ -258,11 +258,6 @@ class MarkerResiduals(nn.Module):
         shared = (here * beside).sum((1, 2)) / (weight * seen).sum(-1).clamp_min(1)
         return ((weight * counted).sum(-1) / weight.sum(-1).clamp_min(1)).sqrt(), shared.clamp_min(0).sqrt()
 
-    def outlying(self, u: Tensor, measured: MeasuredRays, moved: Tensor, limit: float) -> Tensor:
-        """Return the share `[B]` of markers that are seen but more than `limit` standard deviations from their rays."""
-        far = self.angles(u, measured, moved)[0].square().sum(1) > limit**2
-        return (measured.weight * far).mean(-1)
-
 
 def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]:
     """Return the linear interpolation weights of every marker at the inner vertices, `[D, N]`, and their products with the

@@ -14,7 +14,7 @@ from .camera_motion import CameraMotion
 from .contact_force import ContactForce, Linearised
 from .marker_residuals import MarkerResiduals, MeasuredRays, weighed
 from .robust import Cauchy
-from .traction_loss import Memory, TractionLoss
+from .traction_loss import TractionLoss
 
 DAMPING = 1e-6
 """Default relative increase of the matrix's diagonal."""
@@ -63,24 +63,22 @@ class BalanceEquations(nn.Module):
         pressure: Tensor,
         moved: Tensor,
         measured: MeasuredRays,
-        tau: Tensor | float,
-        outlier: Tensor | float,
-        cone: Tensor | float | None = None,
+        tau: Tensor,
+        outlier: Tensor,
         curvature: bool = False,
-        memory: Memory | None = None,
-    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion, Tensor]:
-        """Linearise the equations at a state; `cone`, `curvature` and `memory` are as for `TractionLoss.weights`.
+    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion]:
+        """Linearise the equations at a state; `tau` and `curvature` are as for `TractionLoss.weights`, and `outlier [B]` is
+        the scale of the markers' loss.
 
         Returns:
-            The forces, the normal equations, their loads and corner (see `loads`), the camera's motion, and the weights
-            `w_n [B, N]`.
+            The forces, the normal equations, their loads and corner (see `loads`), and the camera's motion.
         """
         at = self.forces.linearised(u, pressure)
-        W, w_n = self.loss.weights(at.normal, at.force, measured.noise_level, tau, cone, curvature, memory)
+        W = self.loss.weights(at.normal, at.force, measured.noise_level, tau, curvature)
         angle, jacobian = self.bearings.angles(u, measured, moved)
-        weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
+        weight = measured.weight * Cauchy(outlier[:, None]).weight(measured.weight * angle.square().sum(1))
         normal = self.normal_equations(at, W, jacobian, weight)
-        return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle), w_n
+        return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle)
 
     def normal_equations(self, at: Linearised, W: Tensor, jacobian: Tensor, weight: Tensor) -> NormalEquations:
         """Return the normal equations of forces with weights `W [B, 3, 3, N]` and angles with a `weight [B, D]`."""
@@ -109,7 +107,8 @@ class BalanceEquations(nn.Module):
         return CameraMotion(coupling.flatten(2), own, slope)
 
     def matrix(self, normal: NormalEquations, damping: float | Tensor = DAMPING) -> Matrix:
-        """Return `M` in the form that `system.factor` needs, with the relative increase `damping` of its diagonal."""
+        """Return `M` in the form that `system.factor` needs, with the relative increase `damping`, `[]` or `[B]`, of its
+        diagonal."""
         near = self.bearings.near(normal.marker_blocks)
         return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 

@@ -51,7 +51,7 @@ class GemanMcClure(NamedTuple):
     """Geman and McClure's loss `r^2 / (2 (1 + r^2 / s^2))`, which saturates at `s^2 / 2`: large residuals have no weight.
 
     Args:
-        scale: scale `s`, a number or a tensor `[]`.
+        scale: scale `s`, a number or a tensor that the residuals can be divided by.
 
     Example:
         >>> import torch
@@ -78,7 +78,7 @@ class Cauchy(NamedTuple):
     """The Cauchy loss `s^2 / 2 log(1 + r^2 / s^2)`: the influence of an outlier decreases with its distance.
 
     Args:
-        scale: scale `s`, a number or a tensor `[]`.
+        scale: scale `s`, a number or a tensor that the residuals can be divided by.
 
     Example:
         >>> import torch

@@ -7,20 +7,10 @@ from typing import Any, TypeVar
 from ...errors import MembraneError
 
 S = TypeVar("S")
-OUTLIER_DECAY_POWER = 1.3
-"""The scale of the markers' loss is proportional to this power of tau: it starts at twenty times its last value."""
 OLD_NAMES = {
-    "decline": "gnc_fraction",
-    "largest_outlying": "largest_outlier_share",
-    "likely_of_press": "likely_per_displacement",
     "misfit_of_press": "misfit_per_displacement",
-    "patience": "retry_steps_factor",
-    "patient_damping": "retry_damping",
-    "patient_fine_tau": "retry_fine_tau",
-    "patient_tau": "retry_tau",
     "settled_step": "settled_step_tol",
     "unexplained_of_press": "unexplained_per_displacement",
-    "worse_objective": "retry_acceptance_ratio",
 }
 """Names of settings before 0.2.0, which are still accepted, and their present names."""
 
@@ -44,20 +34,12 @@ class ForceBalanceSettings:
     """Settings of `ForceBalance`. Lengths are relative to the surface's size, tractions to the reference traction `p0`.
 
     Args:
-        steps: number of steps from rest on a single grid, without coarser ones.
-        coarse_steps: number of steps from rest on the coarsest of several grids.
-        fine_steps: number of steps from the solution of the coarsest grid.
-        finer_steps: number of steps from the solution of any other grid.
+        steps: largest number of steps on the coarsest grid, the next one, and any finer one; fewer where a frame settles.
         tau: first and last scale of the loss of compressive traction, from rest.
-        fine_tau: the same from the coarsest grid's solution. Finer grids start with the last scale, to stay in its basin.
-        retry_steps_factor: number of steps from rest in a second try, relative to the first.
-        retry_tau: `tau` of a second try.
-        retry_fine_tau: `fine_tau` of a second try.
-        settling_steps: number of additional steps of a second try, at its last scale, on all but the two coarsest grids.
-        settled_step_tol: rms of the last step below which a solution has settled, so that there is no second try.
+        fine_tau: first scale on all grids but the coarsest.
+        settled_step_tol: rms of a step at the last scale below which a solution has settled.
         camera_motion: scale of the prior of the camera's motion relative to the rim at the last tau, px: smaller motions are
             ignored, larger ones are barely penalised further.
-        gnc_fraction: share of the steps in which tau decreases.
         sparsity: twice the loss of the uniform compressive traction p0 on the whole surface, while the loss is quadratic.
         scale_reach: radius of the neighbourhood whose largest push (compressive traction) sets a vertex's scale of tractions.
         scale_share: share of that push below which a push is small.
@@ -71,10 +53,7 @@ class ForceBalanceSettings:
         friction: weight of the loss of shear traction, relative to that of compressive traction.
         slip: scale of the loss of shear traction, above which it is linear.
         cone: how much a push reduces the weight of shear.
-        coarse_cone: the same on the coarsest grid, whose discretisation error looks like friction under a contact.
         reach: radius of the neighbourhood that determines whether a vertex is pushed.
-        renewal: exponent of a step's own weights of normal tractions in the geometric mean with those of the step before. It
-            makes vertices settle that are alternately pushed and pulled.
         floor: smallest weight of a compressive traction. Without it, the position of a vertex under a contact is undetermined.
         outlier: scale of the markers' loss, relative to their noise.
         coarse_outlier: the same on coarser grids, which must not reject markers because of their discretisation error.
@@ -83,8 +62,7 @@ class ForceBalanceSettings:
         longest_step: largest step of a vertex.
         largest_stretch: largest relative change of an edge of the grid in one step.
         damping: relative increase of the diagonal of a step's matrix at the last tau; it is proportional to the square of tau.
-        settling_damping: the same in the last steps of a schedule, in which the solution settles.
-        retry_damping: the same in the `settling_steps`.
+        settling_damping: the same in the last steps of frames that have not settled (`schedule.SETTLING_STEPS`).
         coarsest: smallest number of lines of a coarser grid.
         largest_relative_step: largest rms of the last step of a converged solution.
         largest_volume_error: largest volume error of a converged solution, relative to the rest volume.
@@ -101,45 +79,30 @@ class ForceBalanceSettings:
             displacement (rms), because rest-image drift looks the same while the surface hardly moves.
         largest_pushed: largest share of the surface in contact. If all of it is pushed, the fluid's pressure cannot be
             distinguished from that of a contact.
-        likely_objective: largest objective, per marker seen, without a second try: for a contact without displacement, for any
-            contact, and without contacts; it is larger on coarse grids, as above.
-        likely_per_displacement: increase of the first limit per displacement (rms), up to the second.
-        retry_acceptance_ratio: objective relative to that of a converged first solution, below which a second one replaces it.
-        largest_outlier_share: largest share of markers farther than `far` from their rays without a second try.
 
     Example:
-        >>> [(tau, round(outlier, 1)) for tau, outlier in ForceBalanceSettings().gnc_schedule(2, (4.0, 0.4))]
-        [(4.0, 49.9), (0.4, 2.5)]
+        >>> ForceBalanceSettings(steps=(40, 20, 10)).far
+        10.0
     """
 
-    steps: int = 8
-    coarse_steps: int = 4
-    fine_steps: int = 4
-    finer_steps: int = 3
+    steps: tuple[int, int, int] = (64, 32, 16)
     tau: tuple[float, float] = (4.0, 0.4)
-    fine_tau: tuple[float, float] = (0.8, 0.4)
-    retry_steps_factor: int = 4
-    retry_tau: tuple[float, float] = (16.0, 0.4)
-    retry_fine_tau: tuple[float, float] = (2.0, 0.4)
-    settling_steps: int = 16
-    settled_step_tol: float = 4e-4
+    fine_tau: float = 0.8
+    settled_step_tol: float = 1e-4
     camera_motion: float = 0.005
-    gnc_fraction: float = 0.6
     sparsity: float = 9000.0
     scale_reach: float = 0.08
     scale_share: float = 0.3
     far_share: float = 0.1
     noise_share: float = 0.6
-    contact_noise: float = 2.7
+    contact_noise: float = 3.2
     evidence: float = 0.35
     least_scale: float = 0.02
     decrease: float = 2.0
     friction: float = 3.75
     slip: float = 0.05
     cone: float = 23.0
-    coarse_cone: float = 5.0
     reach: float = 0.04
-    renewal: float = 0.25
     floor: float = 1e-3
     outlier: float = 2.5
     coarse_outlier: float = 5.0
@@ -147,8 +110,7 @@ class ForceBalanceSettings:
     longest_step: float = 0.04
     largest_stretch: float = 0.3
     damping: float = 3e-7
-    settling_damping: float = 1e-4
-    retry_damping: float = 1e-3
+    settling_damping: float = 1e-3
     coarsest: int = 6
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
@@ -159,15 +121,10 @@ class ForceBalanceSettings:
     largest_shared_misfit: float = 1.35
     largest_doubt: tuple[float, float] = (1.0, 5e-4)
     largest_pushed: float = 0.55
-    likely_objective: tuple[float, float, float] = (0.45, 0.95, 1.8)
-    likely_per_displacement: float = 80.0
-    retry_acceptance_ratio: float = 0.9
-    largest_outlier_share: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ("steps", "coarse_steps", "fine_steps", "finer_steps"):
-            if getattr(self, name) < 2:
-                raise MembraneError(f"ForceBalanceSettings: {name} = {getattr(self, name)}; expected at least 2")
+        if not isinstance(self.steps, tuple) or len(self.steps) != 3 or min(self.steps) < 2:
+            raise MembraneError(f"ForceBalanceSettings: steps = {self.steps}; expected three numbers of at least 2")
         if not self.pressure_noise > 0:
             raise MembraneError(f"ForceBalanceSettings: pressure_noise = {self.pressure_noise}; expected more than 0")
 
@@ -175,10 +132,3 @@ class ForceBalanceSettings:
     def far(self) -> float:
         """Angle between a marker and its ray, relative to its noise, beyond which its size carries no information."""
         return 4 * self.outlier
-
-    def gnc_schedule(self, steps: int, tau: tuple[float, float]) -> list[tuple[float, float]]:
-        """Return the scales of the losses of compressive traction (tau) and of markers in every step: graduated
-        non-convexity."""
-        first, last = tau
-        taus = [first * (last / first) ** min(1.0, k / (self.gnc_fraction * (steps - 1))) for k in range(steps)]
-        return [(tau, self.outlier * (tau / last) ** OUTLIER_DECAY_POWER) for tau in taus]

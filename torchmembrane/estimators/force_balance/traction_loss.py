@@ -36,9 +36,6 @@ NO_CONTACT_SCALE = 1e6  # relative to p0; far above any push
 NEGLIGIBLE = 1e-6  # weight of a distant vertex relative to that of the centre, below which it is zero
 TINY = 1e-12  # keeps roots and quotients of zeros finite
 
-Memory = tuple[Tensor, Tensor | float]
-"""The weights `w_n [B, N]` of the step before, and the exponent of a step's own weights in the geometric mean of both."""
-
 
 class LossTerms(NamedTuple):
     """Loss of tractions at the last scale.
@@ -62,8 +59,7 @@ class TractionLoss(nn.Module):
     Args:
         membrane: the rest surface on the solver's grid.
         reference: reference traction `p0`.
-        cone: see `ForceBalanceSettings`.
-        settings: settings with the other constants.
+        settings: settings of the estimator.
     """
 
     area: Tensor
@@ -72,9 +68,9 @@ class TractionLoss(nn.Module):
     push_noise: Tensor
     noise_gain: Tensor
 
-    def __init__(self, membrane: Membrane, reference: float, cone: float, settings: ForceBalanceSettings):
+    def __init__(self, membrane: Membrane, reference: float, settings: ForceBalanceSettings):
         super().__init__()
-        self.reference, self.size, self.cone, self.settings = reference, membrane.size, cone, settings
+        self.reference, self.size, self.settings = reference, membrane.size, settings
         self.shear = PseudoHuber(settings.slip)
 
         def within(field: Tensor) -> Tensor:
@@ -109,23 +105,22 @@ class TractionLoss(nn.Module):
         """Return the share `[B]` of the surface with a push above the last scale `tau`, from `S^2 [B, N]`."""
         return (compression2 > self.settings.tau[-1] ** 2).to(self.area.dtype) @ self.area / self.area.sum()
 
-    def shear_weight(self, compression2: Tensor, cone: float | Tensor | None = None) -> Tensor:
-        """Return `kappa [B, N]`; the default of `cone` is that of this loss."""
-        settings, cone = self.settings, self.cone if cone is None else cone
-        return settings.friction / (1 + cone * (compression2 + settings.slip**4).sqrt())
+    def shear_weight(self, compression2: Tensor) -> Tensor:
+        """Return `kappa [B, N]` for squared pushes `S^2 [B, N]`."""
+        settings = self.settings
+        return settings.friction / (1 + settings.cone * (compression2 + settings.slip**4).sqrt())
 
-    def scale2(self, compression2: Tensor, noise_level: Tensor, tau: float | Tensor) -> Tensor:
+    def scale2(self, compression2: Tensor, noise_level: Tensor, tau: Tensor) -> Tensor:
         """Return `rho^2 [B, N]` from `S^2 [B, N]` and the frames' noise relative to that at rest, `[B]`.
 
-        A lower bound depends on the scale `tau` of the step, so that `rho` starts at 1 from rest, where nothing pushes yet.
+        A lower bound depends on the scale `tau [B]` of the step, so that `rho` starts at 1 from rest, where nothing pushes yet.
         """
         settings, last = self.settings, self.settings.tau[-1]
         top = compression2.amax(-1, keepdim=True).clamp_min(TINY)
         around = top * (((compression2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
         noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
         expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
-        tau = tau if isinstance(tau, Tensor) else compression2.new_full((), tau)
-        least = (settings.decrease * (tau / last - 1) + settings.least_scale).clamp_max(1.0)
+        least = (settings.decrease * (tau / last - 1) + settings.least_scale).clamp_max(1.0)[:, None]
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
     def contact_scale(self, terms: LossTerms, noise_level: Tensor, gain: Tensor) -> Tensor:
@@ -147,44 +142,37 @@ class TractionLoss(nn.Module):
         normal: Tensor,
         force: Tensor,
         noise_level: Tensor,
-        tau: float | Tensor,
-        cone: float | Tensor | None = None,
+        tau: Tensor,
         curvature: bool = False,
-        memory: Memory | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Tensor:
         """Return the weights of the contact forces, whose parabolas touch the loss.
 
         Args:
             normal: outward unit normals at the inner vertices, `[B, 3, N]`.
             force: contact forces, `[B, 3, N]`.
             noise_level: noise of the frames relative to that at rest, `[B]`.
-            tau: scale of the loss of compressive traction.
-            cone: how much a push reduces the weight of shear; default: that of this loss.
+            tau: scale of the loss of compressive traction, `[B]`.
             curvature: whether to use the curvature of a push's loss, zero where it is negative, instead of its weight.
-            memory: weights of the step before; `w_n` is then a geometric mean with them.
 
         Returns:
-            `W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`, and `w_n [B, N]`.
+            `W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`.
         """
         q_n, shear2, compression2 = self.parts(force / self.area, normal)
         rho2 = self.scale2(compression2, noise_level, tau)
         shear2, compression2 = shear2 / rho2, compression2 / rho2
-        compressive = GemanMcClure(tau)
+        compressive = GemanMcClure(tau[:, None])
         pushed = compressive.curvature(compression2) if curvature else compressive.weight(compression2)
         w_n = self.settings.floor + torch.where(q_n < 0, pushed, 1.0)
-        if memory is not None:
-            before, renewal = memory
-            w_n = before * (w_n / before) ** renewal
-        w_t = self.shear_weight(compression2, cone) * self.shear.weight(shear2)
+        w_t = self.shear_weight(compression2) * self.shear.weight(shear2)
         scale = self.settings.sparsity / (self.reference * self.size) ** 2 / self.area / rho2
         one = torch.eye(3, dtype=force.dtype, device=force.device)[..., None]
         along = (scale * (w_n - w_t))[:, None] * normal
-        return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one, w_n
+        return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one
 
     def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> LossTerms:
         """Return the loss of tractions `[B, 3, N]` at the last scale `tau`, evaluated at each vertex's own push."""
         q_n, shear2, compression2 = self.parts(traction, normal)
-        rho2 = self.scale2(compression2, noise_level, self.settings.tau[-1])
+        rho2 = self.scale2(compression2, noise_level, torch.full_like(noise_level, self.settings.tau[-1]))
         q_n, shear2 = q_n / rho2.sqrt(), shear2 / rho2
         pushes = GemanMcClure(self.settings.tau[-1]).loss((-q_n).clamp_min(0) ** 2)
         others = q_n.clamp_min(0) ** 2 / 2 + self.shear_weight(compression2 / rho2) * self.shear.loss(shear2)

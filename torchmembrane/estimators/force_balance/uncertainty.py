@@ -90,11 +90,12 @@ def linearise(
         cavity: law of the cavity's filling.
         state: the solution.
         measured: the markers' rays.
-        scales: scales of the losses of tractions and of markers.
+        scales: scales of the losses of tractions and of markers, the same for all frames.
         play: scale of the prior of the camera's motion, px, as for `CameraMotion.with_prior`.
         curvature: as for `TractionLoss.weights`.
     """
-    at, normal, loads, corner, motion, _ = equations.linearised(*state, measured, *scales, curvature=curvature)
+    tau, outlier = (torch.full_like(state.pressure, scale) for scale in scales)
+    at, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier, curvature=curvature)
     vWv = pulled(corner, measured.gauge, state.pressure - cavity.rest_pressure)[1]
     factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
     compliance = cavity.condition(membrane.volume(membrane.rest + state.u) - membrane.rest_volume, state.pressure)[1]

@@ -62,6 +62,7 @@ class Numbers(NamedTuple):
     size: float
     friction: float
     slip: float
+    cone: float
     sparsity: float
     floor: float
     last_tau: float
@@ -72,6 +73,9 @@ class Numbers(NamedTuple):
     decrease: float
     least_scale: float
     camera_motion: float
+    damping: float
+    settling_damping: float
+    settled_step_tol: float
     longest_step: float
     largest_stretch: float
     contact_noise: float
@@ -173,9 +177,8 @@ def scaled(c, work, noise_level, tau):
 
 
 @compiled
-def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
-    """Apply `TractionLoss.weights`: return `W`, and set `before` to the weights of the normal tractions; `curvature`: use the
-    curvature of a push's loss in place of its weight."""
+def weigh(c, work, noise_level, tau, curvature):
+    """Apply `TractionLoss.weights`: compute `W`; `curvature`: use the curvature of a push's loss in place of its weight."""
     k, n = c.numbers, c.surface.free.shape[1]
     scaled(c, work, noise_level, tau)
     for i in range(len(c.area)):
@@ -185,20 +188,18 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
         ratio = pushed / tau**2
         of_push = max(curvature_of_push(ratio), 0.0) if curvature else weight_of_push(ratio)
         w_n = k.floor + (of_push if q_n < 0 else 1.0)
-        w_n = before[i] * (w_n / before[i]) ** renewal
-        w_t = weight_of_shear(k, pushed, cone) / np.sqrt(shear2 / rho2 + k.slip**2)
+        w_t = weight_of_shear(k, pushed) / np.sqrt(shear2 / rho2 + k.slip**2)
         scale = k.sparsity / (k.reference * k.size) ** 2 / c.area[i] / rho2
         for a in range(3):
             for b in range(3):
                 work.W[a, b, at] = scale * (w_n - w_t) * work.normal[i, a] * work.normal[i, b]
             work.W[a, a, at] += scale * w_t
-        before[i] = w_n
 
 
 @compiled
-def weight_of_shear(k, push2, cone):
+def weight_of_shear(k, push2):
     """Return `TractionLoss.shear_weight`."""
-    return k.friction / (1 + cone * np.sqrt(push2 + k.slip**4))
+    return k.friction / (1 + k.cone * np.sqrt(push2 + k.slip**4))
 
 
 @compiled

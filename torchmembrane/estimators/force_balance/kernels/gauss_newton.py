@@ -1,4 +1,4 @@
-"""One step of force balance as machine code: `GaussNewton.step`, frame by frame, without gradients.
+"""The steps of force balance as machine code: `GaussNewton.forward`, frame by frame, without gradients.
 
 On a processor, calling the six hundred tensor operations of a step takes longer than computing them. The formulas are those of
 `gauss_newton`, `camera_motion`, `cavity` and `kkt`.
@@ -12,21 +12,66 @@ from ....mechanics.native_membrane import linearise
 from ....solve.native_band import RANK, ROWS, backward, factor
 from ....solve.symmetric_2x2 import symmetric_solution
 from ..camera_motion import camera_stiffness
+from ..schedule import LEAST_MOVE, falling, outlier_scale
 from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, sum_blocks, weigh
 from .markers import load_markers
+from .solution import OBJECTIVE, TOLD, solution_of
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
+ratio_of_tau, scale_of_outliers = compiled(falling), compiled(outlier_scale)
 
 
 @compiled
-def step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales):
-    """Take one step in place: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `weights [N]` of the normal tractions are
-    overwritten."""
-    tau, outlier, cone, renewal, damping = scales[0], scales[1], scales[2], scales[3], scales[4]
+def settle(c, work, u, pressure, moved, before, seen, noise_level, gauge, tau, steps, settling):
+    """Take at most `steps` steps in place, the last `settling` of them as in `GaussNewton._next_keeping_best`; `before
+    [m, n, 3]` becomes the displacement before the last."""
+    k, done = c.numbers, False
+    before[:] = u
+    for _ in range(steps - settling):
+        if not done:
+            before[:] = u
+            step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, 0.0)
+            length = _length(c, u, before)
+            done = not (tau > k.last_tau or length > k.settled_step_tol)
+            tau = max(k.last_tau, tau * ratio_of_tau(max(length, LEAST_MOVE)))
+    if done or settling == 0:
+        return
+    lowest, told = np.inf, np.empty(TOLD, u.dtype)
+    traction, reference = np.empty_like(u), np.empty(u.shape[:2], u.dtype)
+    best_u, best_pressure, best_moved, best_before = u.copy(), pressure.copy(), moved.copy(), before.copy()
+    for _ in range(settling):
+        if not done:
+            before[:] = u
+            step(c, work, u, pressure, moved, seen, noise_level, gauge, k.last_tau, k.settling_damping)
+            done = not _length(c, u, before) > k.settled_step_tol
+            solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, 1.0, told, traction, reference)
+            if told[OBJECTIVE] < lowest:
+                lowest = told[OBJECTIVE]
+                best_u[:], best_pressure[:], best_moved[:], best_before[:] = u, pressure, moved, before
+    u[:], pressure[:], moved[:], before[:] = best_u, best_pressure, best_moved, best_before
+
+
+@compiled
+def _length(c, u, before):
+    """Return `GaussNewton._length` of a step."""
     m, n = c.surface.free.shape
+    total = 0.0
+    for i in range(m):
+        for j in range(n):
+            for a in range(3):
+                total += (u[i, j, a] - before[i, j, a]) ** 2
+    return np.sqrt(total / (m * n)) / c.numbers.size
+
+
+@compiled
+def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, least_damping):
+    """Take one step in place: `u [m, n, 3]`, `pressure [1]` and `moved [4]` are overwritten."""
+    (m, n), k = c.surface.free.shape, c.numbers
+    outlier = scale_of_outliers(k.outlier, tau / k.last_tau)
+    damping = max(k.damping * blunt_at(k, tau), least_damping)
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
     own, slope = np.zeros((4, 4)), np.zeros(4)
-    weigh(c, work, weights, noise_level, tau, cone, renewal, np.bool_(False))
+    weigh(c, work, noise_level, tau, np.bool_(False))
     fWv, vWv = load_forces(c, work)
     load_markers(c, work, u, moved, seen, outlier, own, slope)
     sum_blocks(c, work)
@@ -83,9 +128,15 @@ def substituted(work, solved):
 
 
 @compiled
+def blunt_at(k, tau):
+    """Return by how much a step at a scale `tau` is damped more than at the last one."""
+    return (min(tau, k.first_tau) / k.last_tau) ** 2
+
+
+@compiled
 def stiffness_at(k, moved, tau):
     """Return the camera's stiffness at a scale `tau` of the tractions' loss."""
-    play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
+    play = k.camera_motion * blunt_at(k, tau)
     moved2 = 0.0  # summed in double precision
     for a in range(4):
         moved2 += moved[a] ** 2

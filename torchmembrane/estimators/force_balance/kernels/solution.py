@@ -16,9 +16,8 @@ loss_of_push = compiled(geman_mcclure_loss)
 
 
 @compiled
-def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, given, told, traction, reference):
-    """Compute `told [7]`, `traction [m, n, 3]` and `reference [m, n]` of a state; `given [2]`: `cone`, and the limit `far` of a
-    marker's angle."""
+def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, far, told, traction, reference):
+    """Compute `told [7]`, `traction [m, n, 3]` and `reference [m, n]` of a state; `far` is the limit of a marker's angle."""
     (m, n), k, step2 = c.surface.free.shape, c.numbers, 0.0
     told[VOLUME] = linearise(c.surface, u, pressure, work.force, work.A, work.volume)
     scaled(c, work, noise_level, k.last_tau)
@@ -29,8 +28,8 @@ def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, g
                 traction[i, j, a] = 0.0
             reference[i, j] = k.reference
     told[STEP] = np.sqrt(step2 / (m * n)) / k.size
-    pushes, others = _tractions(c, work, given[0], told, traction)
-    count, misfit, at_rest = _markers(c, u, moved, seen, given[1], told)
+    pushes, others = _tractions(c, work, told, traction)
+    count, misfit, at_rest = _markers(c, u, moved, seen, far, told)
     rise = pressure[0] - k.rest_pressure
     misfit += gauge[1] * (rise - gauge[0]) ** 2 / 2
     told[UNEXPLAINED] = (misfit + others) / count
@@ -43,7 +42,7 @@ def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, g
 
 
 @compiled
-def _tractions(c, work, cone, told, traction):
+def _tractions(c, work, told, traction):
     """Apply `TractionLoss.forward`: return the loss of pushes and that of pulls and shear, the tractions, and the pushed
     share of the area."""
     k, n, pushes, others, whole, pushed = c.numbers, c.surface.free.shape[1], 0.0, 0.0, 0.0, 0.0
@@ -57,7 +56,7 @@ def _tractions(c, work, cone, told, traction):
             pushes += unit * loss_of_push(q_n * q_n, k.last_tau)
         else:
             others += unit * q_n * q_n / 2
-        others += unit * weight_of_shear(k, push2 / rho2, cone) * (np.sqrt(shear2 + k.slip**2) - k.slip)
+        others += unit * weight_of_shear(k, push2 / rho2) * (np.sqrt(shear2 + k.slip**2) - k.slip)
         whole += c.area[i]
         pushed += c.area[i] if push2 > k.last_tau**2 else 0.0
     told[PUSHED] = pushed / whole

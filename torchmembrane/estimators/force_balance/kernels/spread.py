@@ -14,18 +14,18 @@ from .markers import load_markers
 
 
 @compiled
-def spread_of(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales, found):
-    """Return the standard deviations `[4]` at the state of a frame."""
+def spread_of(c, work, u, pressure, moved, seen, noise_level, gauge, outlier, damping, found):
+    """Return the standard deviations `[4]` at the state of a frame, with the scale `outlier` of the markers' loss."""
     own, slope, size = np.zeros((4, 4)), np.zeros(4), len(work.scale)
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
-    weigh(c, work, weights, noise_level, scales[0], scales[2], scales[3], np.bool_(True))
+    weigh(c, work, noise_level, c.numbers.last_tau, np.bool_(True))
     vWv = load_forces(c, work)[1] + gauge[1]
-    load_markers(c, work, u, moved, seen, scales[1], own, slope)
+    load_markers(c, work, u, moved, seen, outlier, own, slope)
     by_pressure = _load_wanted(c, work, u)
     sum_blocks(c, work)
-    products = factored(c, work, scales[4], np.intp(LOADS))
+    products = factored(c, work, damping, np.intp(LOADS))
     for a in range(4):
-        own[a, a] += stiffness_at(c.numbers, moved, scales[0])
+        own[a, a] += stiffness_at(c.numbers, moved, c.numbers.last_tau)
     following = _camera_eased(products, own)
     compliance, solved = cavity_condition(c.numbers, rise, pressure[0])[1], np.empty(size, u.dtype)
     for k in range(WANTED, LOADS):

@@ -16,12 +16,13 @@ from ....mechanics.native_membrane import Surface, surface_of
 from ....solve import native_band, native_rows, symmetric_2x2
 from ....solve.native_rows import within
 from ....solve.stencil import inner
-from .. import camera_motion, robust
+from .. import camera_motion, robust, schedule
 from ..marker_residuals import MeasuredRays
 from ..normal_equations import DAMPING, BalanceEquations
+from ..schedule import settling_of
 from . import equations, gauss_newton, markers, solution, spread
 from .equations import Constants, Numbers, Workspace, workspace
-from .gauss_newton import step
+from .gauss_newton import settle
 from .solution import TOLD, solution_of
 from .spread import spread_of
 
@@ -42,25 +43,29 @@ class NativeSteps:
         equations: BalanceEquations,
         cavity: CavityLaw,
         state: tuple[Tensor, Tensor, Tensor],
-        weights: Tensor,
         measured: MeasuredRays,
-        rows: Sequence[Sequence[float]],
+        tau: float,
+        steps: int,
     ) -> list[Tensor]:
-        """Return displacement, pressure and camera motion after the steps, the displacement before the last step, and the
-        weights.
+        """Return displacement, pressure and camera motion after the steps, and the displacement before the last step.
 
-        Arguments are those of `GaussNewton.step`; `rows`: the parameters of every step.
+        Arguments are those of `GaussNewton.forward`.
         """
         constants, fixed = self._prepared(equations, cavity, measured)
-        changing = [value.clone(memory_format=torch.contiguous_format) for value in (*state, weights)]
-        changing.append(changing[0].clone())
-        u, pressure, moved, weighing, before = (value.numpy() for value in changing)
+        changing = [value.clone(memory_format=torch.contiguous_format) for value in (*state, state[0])]
+        u, pressure, moved, before = (value.numpy() for value in changing)
         surface = -1, *equations.forces.membrane.grid, 3
-        surfaces = u.reshape(surface), pressure, moved, weighing, before.reshape(surface)
-        each = [*surfaces, *fixed, *_nothing(u), np.empty((len(u), 0), u.dtype)]
-        self._shared_out(equations, constants, each, np.array(rows, float).reshape(-1, 5))
-        after, pressure_after, camera, weights, before_last = changing
-        return [after, pressure_after, camera, before_last, weights]
+        each = [
+            u.reshape(surface),
+            pressure,
+            moved,
+            before.reshape(surface),
+            *fixed,
+            *_nothing(u),
+            np.empty((len(u), 0), u.dtype),
+        ]
+        self._shared_out(equations, constants, each, (tau, steps, settling_of(steps)))
+        return changing
 
     def spread(
         self,
@@ -73,11 +78,9 @@ class NativeSteps:
         """Return the standard deviations of force and depth, `[B, 4]`; arguments as for `deviations.spreads`."""
         constants, fixed = self._prepared(equations, cavity, measured)
         u, pressure, moved = (value.contiguous().numpy() for value in state)
-        weights, found = np.ones((len(u), len(constants.area)), u.dtype), np.empty((len(u), 4), u.dtype)
-        scales = np.array([[equations.loss.settings.tau[1], outlier, equations.loss.cone, 1.0, DAMPING]])
+        found = np.empty((len(u), 4), u.dtype)
         u = u.reshape(-1, *equations.forces.membrane.grid, 3)
-        each = [u, pressure, moved, weights, u, *fixed, *_nothing(u), found]
-        self._shared_out(equations, constants, each, scales)
+        self._shared_out(equations, constants, [u, pressure, moved, u, *fixed, *_nothing(u), found], (outlier, DAMPING, 0))
         return torch.from_numpy(found)
 
     def solution(
@@ -96,14 +99,13 @@ class NativeSteps:
         """
         constants, fixed = self._prepared(equations, cavity, measured)
         u, pressure, moved, earlier = (value.contiguous().numpy() for value in (*state, before))
-        weights, given = np.empty((len(u), 0), u.dtype), np.array([[equations.loss.cone, far, 0, 0, 0]], float)
         shapes = (len(u), TOLD), state[0].shape, state[0].shape[:-1]
         found = [state[0].new_empty(shape) for shape in shapes]
         told, traction, reference = (value.numpy() for value in found)
         grid = equations.forces.membrane.grid
         u, earlier, traction = (value.reshape(-1, *grid, 3) for value in (u, earlier, traction))
-        each = [u, pressure, moved, weights, earlier, *fixed, traction, reference.reshape(-1, *grid), told]
-        self._shared_out(equations, constants, each, given)
+        each = [u, pressure, moved, earlier, *fixed, traction, reference.reshape(-1, *grid), told]
+        self._shared_out(equations, constants, each, (far, 0, 0))
         return found[0].unbind(1), found[1], found[2]
 
     def _prepared(
@@ -114,8 +116,11 @@ class NativeSteps:
         fixed = [value.contiguous().numpy() for value in (*measured[:5], gauge)]
         return self._found(equations, cavity, fixed[0].dtype), fixed
 
-    def _shared_out(self, equations: BalanceEquations, constants: Constants, each: list[np.ndarray], rows: np.ndarray) -> None:
+    def _shared_out(
+        self, equations: BalanceEquations, constants: Constants, each: list[np.ndarray], given: tuple[float, float, float]
+    ) -> None:
         """Call `frames` on parts of the arrays `each`, the last of which is `found`, with one thread per part."""
+        numbers = np.array(given, float)
         grid, dtype, threads = equations.forces.membrane.grid, each[0].dtype, min(torch.get_num_threads(), len(each[0]))
 
         def take(part: Sequence[np.ndarray]) -> None:
@@ -124,7 +129,7 @@ class NativeSteps:
             except IndexError:
                 work = workspace(grid, len(constants.positions), dtype)
             with compiled.compiling(np.dtype(dtype)):
-                frames(constants, work, *part[:-1], rows, part[-1])
+                frames(constants, work, *part[:-1], numbers, part[-1])
             self._idle[dtype].append(work)
 
         if threads <= 1:
@@ -164,7 +169,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
     )
 
     def array(values: Tensor) -> np.ndarray:
-        return np.ascontiguousarray(values.numpy(), dtype)
+        return np.ascontiguousarray(values.detach().numpy(), dtype)
 
     surroundings, wider = array(loss.surroundings), array(loss.wider)
     return Constants(
@@ -212,7 +217,6 @@ def _entry(sources: str) -> Any:
         u,
         pressure,
         moved,
-        weights,
         before,
         origins,
         across,
@@ -222,33 +226,31 @@ def _entry(sources: str) -> Any:
         gauge,
         traction,
         scale,
-        rows,
+        given,
         found,
     ):
         """Steps of every frame, and then its deviations, or what its state amounts to.
 
-        `u [B, m, n, 3]`, `pressure [B]`, `moved [B, 4]` and `weights [B, N]`, of the normal tractions, become those after the
-        steps; `before [B, m, n, 3]` the displacement before the last. With the last of the rows no step is taken where `found`
-        is asked for: `[B, 4]`, the standard deviations of force and depth; `[B, 7]` what is `TOLD`, with `traction
-        [B, m, n, 3]` and `scale [B, m, n]`, what they are measured against.
+        If nothing is `found`, `[B, 0]`, then `u [B, m, n, 3]`, `pressure [B]` and `moved [B, 4]` become those after the steps,
+        and `before [B, m, n, 3]` the displacement before the last. Otherwise no step is taken, and `found` is filled: `[B, 4]`
+        with the standard deviations of force and depth; `[B, 7]` with what is `TOLD`, and then also `traction [B, m, n, 3]` and
+        `scale [B, m, n]`, what they are measured against.
 
-        c: `Constants`, work: a `Workspace`, origins to gauge: `MeasuredRays`, rows: of every step tau, outlier, cone, renewal
-        and damping, `[S, 5]`.
+        c: `Constants`, work: a `Workspace`, origins to gauge: `MeasuredRays`, given: for steps the first tau, their number and
+        how many of them settle; for deviations the scale of the markers' loss and the damping; else the limit of a marker's
+        angle; `[3]`.
         """
         wanted = found.shape[1]
-        count = len(rows) - (wanted > 0)
         for b in range(len(u) if sources else 0):
-            state, measured = (u[b], pressure[b : b + 1], moved[b], weights[b]), (noise_level[b], gauge[b])
-            seen, now, earlier = (origins[b], across[b], weight[b], motion[b]), u[b].ravel(), before[b].ravel()
-            for k in range(count):
-                for i in range(len(earlier) if k == count - 1 else 0):
-                    earlier[i] = now[i]
-                step(c, work, *state, seen, *measured, rows[k])
+            state, measured = (u[b], pressure[b : b + 1], moved[b]), (noise_level[b], gauge[b])
+            seen = origins[b], across[b], weight[b], motion[b]
             if wanted == TOLD:
                 told = found[b], traction[b], scale[b]
-                solution_of(c, work, *state[:3], before[b], seen, *measured, rows[count], *told)
+                solution_of(c, work, *state, before[b], seen, *measured, given[0], *told)
             elif wanted > 0:
-                spread_of(c, work, *state, seen, *measured, rows[count], found[b])
+                spread_of(c, work, *state, seen, *measured, given[0], given[1], found[b])
+            else:
+                settle(c, work, *state, before[b], seen, *measured, given[0], int(given[1]), int(given[2]))
 
     return frames
 
@@ -256,7 +258,7 @@ def _entry(sources: str) -> Any:
 SOURCES = fingerprint(
     __file__,
     *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, markers, native_band, native_membrane)),
-    *(each.__file__ for each in (native_rows, robust, solution, spread, symmetric_2x2)),
+    *(each.__file__ for each in (native_rows, robust, schedule, solution, spread, symmetric_2x2)),
 )
 frames = _entry(SOURCES)
 compiled = Kept(frames, SOURCES)

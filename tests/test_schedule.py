@@ -1,0 +1,281 @@
+"""Every frame lowers the losses' scale at its own speed till it settles."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.force_balance.gauss_newton import State
+from torchmembrane.estimators.force_balance.schedule import RATE, SETTLING_STEPS, STILL, falling, outlier_scale, settling_of
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.machine_code import using
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.surface.membrane import Membrane
+from torchmembrane.surface.shapes import spherical_cap
+
+SETTINGS = ForceBalanceSettings()
+DOME = spherical_cap(12, 9, 3, (17, 17))
+
+
+def estimator(dome: Membrane = DOME, **changes) -> ForceBalance:
+    positions = spherical_cap(12, 9, 3, (13, 13)).rest[~spherical_cap(12, 9, 3, (13, 13)).fixed]
+    material = ElasticEnergy(dome, "neo_hookean", 1.3)
+    markers = dome.closest_points(positions.numpy())
+    return ForceBalance(dome, material, markers, positions, noise=1e-3, settings=replace(SETTINGS, **changes))
+
+
+def seen(positions: torch.Tensor) -> Observation:
+    directions = torch.nn.functional.normalize(positions, dim=-1)
+    return Observation(torch.zeros_like(directions), directions, torch.ones_like(directions[..., 0]))
+
+
+@pytest.fixture(scope="module")
+def dented() -> Observation:
+    """Two frames: at rest, and markers drawn to one side by up to a twentieth of the dome's size."""
+    rest = estimator().equations.bearings.positions
+    drawn = 0.05 * DOME.size * torch.exp(-((rest - rest[30]) ** 2).sum(-1) / 150)
+    return seen(torch.stack([rest, rest + drawn[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=rest.dtype)]))
+
+
+def edges(x: torch.Tensor, membrane: Membrane) -> torch.Tensor:
+    grid = x.unflatten(1, membrane.grid)
+    return torch.cat([grid.diff(dim=axis).flatten(1, 2) for axis in (1, 2)], 1)
+
+
+@pytest.mark.parametrize("tau", SETTINGS.tau)
+def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
+    one = estimator()
+    measured = one.equations.bearings.measured(dented)
+    x = one.membrane.rest + 0.3 * torch.randn(
+        2, *one.membrane.rest.shape, generator=torch.Generator().manual_seed(0)
+    ).double() * (~one.membrane.fixed[:, None])
+    start = State(x - one.membrane.rest, *one.at_rest(measured.weight)[1:])
+    tau = torch.full((2,), tau).double()
+    after = one.gauss_newton.step(start, measured, tau, 0 * tau)
+    before, now = edges(x, DOME), edges(one.membrane.rest + after.u, DOME)
+    share = ((now - before).norm(dim=-1) / before.norm(dim=-1)).amax(-1)
+    assert (share < SETTINGS.largest_stretch * (1 + 1e-6)).all() and (share > 0.01).all()
+
+
+def test_the_scale_falls_slowly_while_the_surface_moves_and_fast_where_it_stands_still():
+    moved = torch.tensor([1.0, STILL, STILL / 9]).double()
+    torch.testing.assert_close(falling(moved), torch.tensor([RATE, RATE**2, RATE**10]).double(), rtol=1e-3, atol=0)
+    assert [falling(value) for value in moved.tolist()] == pytest.approx(falling(moved).tolist(), rel=1e-12)
+    assert [settling_of(steps) for steps in (1, 2, 9, 16, 64)] == [0, 1, 4, SETTLING_STEPS, SETTLING_STEPS]
+
+
+@pytest.fixture
+def taus(monkeypatch):
+    """Scales and dampings of every step, as lists over the frames that take it; by tensor operations."""
+    one, taken = estimator(), []
+    step = one.gauss_newton.step
+
+    def watched(state, measured, tau, damping):
+        after = step(state, measured, tau, damping)
+        moved = (after.u - state.u).square().sum(-1).mean(-1).sqrt() / one.size
+        taken.append((tau.tolist(), damping.tolist(), moved.tolist()))
+        return after
+
+    monkeypatch.setattr(one.gauss_newton, "step", watched)
+    monkeypatch.setattr("torchmembrane.estimators.force_balance.gauss_newton.GaussNewton._nested_step", GaussStep(watched))
+    return one, taken
+
+
+class GaussStep:
+    """A step in place of the region that `torch.compile` compiles once."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def __call__(self, *given):
+        return tuple(self.step(*given))
+
+
+def test_each_frame_lowers_its_scale_by_how_far_it_has_moved_and_stops_when_it_has_settled(dented, taus):
+    """The frame at rest is through when the other still moves; the last scale is not undercut."""
+    one, taken = taus
+    measured = one.equations.bearings.measured(dented)
+    with torch.no_grad(), using(False):
+        one.gauss_newton(one.at_rest(measured.weight), measured, 4.0, 64)
+    both = [step for step in taken if len(step[0]) == 2]
+    assert 1 < len(both) < len(taken) < 56 and all(len(step[0]) == 1 for step in taken[len(both) :])
+    tau = {0: 4.0, 1: 4.0}
+    for scales, dampings, moved in taken:
+        assert dampings == [0.0] * len(scales)
+        for frame, scale, by in zip(range(2) if len(scales) == 2 else [1], scales, moved, strict=True):
+            assert scale == pytest.approx(tau[frame])
+            tau[frame] = max(SETTINGS.tau[1], scale * falling(max(by, 1e-9)))
+    last = both[-1][2][0], taken[-1][2][0]
+    assert max(last) <= SETTINGS.settled_step_tol < taken[-2][2][0]
+    assert tau == {0: SETTINGS.tau[1], 1: SETTINGS.tau[1]}
+
+
+def test_a_frame_of_a_batch_is_that_frame_alone(dented):
+    """By tensor operations, however many steps the others take."""
+    one = estimator()
+    measured = one.equations.bearings.measured(dented)
+    alone = type(measured)(*(None if value is None else value[1:] for value in measured))
+    with torch.no_grad(), using(False):
+        both, _ = one.gauss_newton(one.at_rest(measured.weight), measured, 4.0, 64)
+        single, _ = one.gauss_newton(one.at_rest(alone.weight), alone, 4.0, 64)
+    torch.testing.assert_close(both.u[1:], single.u, rtol=0, atol=1e-9 * one.size)
+
+
+def test_a_frame_that_breaks_down_takes_no_further_steps(dented, taus):
+    one, taken = taus
+    broken = dented._replace(directions=torch.where(torch.tensor([True, False])[:, None, None], torch.nan, dented.directions))
+    measured = one.equations.bearings.measured(broken)
+    with torch.no_grad(), using(False):
+        state, _ = one.gauss_newton(one.at_rest(measured.weight), measured, 4.0, 64)
+    assert len([step for step in taken if len(step[0]) == 2]) <= 2
+    assert state.u[0].isnan().any() and state.u[1].isfinite().all()
+
+
+def test_frames_that_have_not_settled_take_damped_steps_at_the_last_scale(dented, taus):
+    """The last eight of twelve steps; the frame at rest has settled before."""
+    one, taken = taus
+    measured = one.equations.bearings.measured(dented)
+    with torch.no_grad(), using(False):
+        one.gauss_newton(one.at_rest(measured.weight), measured, 0.5, 12)
+    damped = [step for step in taken if step[1][0] > 0]
+    assert 0 < len(damped) <= settling_of(12) == 6 and damped == taken[-len(damped) :]
+    assert all(step[:2] == ([SETTINGS.tau[1]], [SETTINGS.settling_damping]) for step in damped)
+
+
+def test_each_grid_begins_with_its_scale_and_number_of_steps(dented, monkeypatch):
+    """Of three grids, with 9, 17 and 33 lines; the second takes a step first, which tells where it is to be dented."""
+    fine, given = estimator(spherical_cap(12, 9, 3, (33, 33))), []
+    for one in (fine, fine.coarse, fine.coarse.coarse):
+        steps = one.gauss_newton.forward
+        monkeypatch.setattr(
+            one.gauss_newton,
+            "forward",
+            lambda state, measured, tau, count, steps=steps: given.append((tau, count)) or steps(state, measured, tau, count),
+        )
+    fine._solve_on_grid(fine.equations.bearings.measured(dented))
+    coarsest, second, finest = SETTINGS.steps
+    first, between = SETTINGS.tau[0], SETTINGS.fine_tau
+    assert given == [(first, coarsest), (between, 1), (between, second), (between, finest)]
+    assert (fine.dent, fine.coarse.coarse.dent) == (None, None) and fine.coarse.dent is not None
+
+
+def test_coarser_grids_lose_fewer_markers():
+    """Of three grids; the markers' scale begins at twenty times its last, because tau begins at ten times."""
+    fine = estimator(spherical_cap(12, 9, 3, (33, 33)))
+    for one, last in (
+        (fine, SETTINGS.outlier),
+        (fine.coarse, SETTINGS.coarse_outlier),
+        (fine.coarse.coarse, SETTINGS.coarse_outlier),
+    ):
+        assert one.gauss_newton.settings.outlier == last < 2.1 * SETTINGS.outlier
+    first, last = SETTINGS.tau
+    assert outlier_scale(SETTINGS.outlier, first / last) == pytest.approx(20 * SETTINGS.outlier, rel=0.01)
+    assert outlier_scale(SETTINGS.outlier, 1.0) == SETTINGS.outlier
+
+
+def test_of_the_damped_steps_the_likeliest_state_is_kept(dented, monkeypatch):
+    """Two frames that never settle; of the last four of eight steps, one of which breaks down."""
+    one, judged = estimator(settled_step_tol=0.0), []
+    likely = iter(torch.tensor([[3.0, 1.0], [2.0, 2.0], [torch.nan, 3.0], [4.0, 4.0]]).double())
+    monkeypatch.setattr(one.gauss_newton, "objective", lambda state, *_: judged.append(state) or next(likely))
+    measured = one.equations.bearings.measured(dented)
+    with torch.no_grad(), using(False):
+        state, before = one.gauss_newton(one.at_rest(measured.weight), measured, 0.4, 8)
+    assert len(judged) == 4
+    for kept, at in zip(state, zip(*judged, strict=True), strict=True):
+        torch.testing.assert_close(kept, torch.stack([at[1][0], at[0][1]]), rtol=0, atol=0)
+    torch.testing.assert_close(before[0], judged[0].u[0], rtol=0, atol=0)
+    assert 0 < (before[1] - judged[0].u[1]).abs().max() < 0.1 * one.size
+
+
+def test_where_contacts_push_nearly_everywhere_nothing_is_explained(dented):
+    """A half of the surface pushed, the other pulled; all pulled; just below and just above what may be pushed."""
+    one = estimator()
+    loss, within, outward = one.equations.loss, ~one.membrane.fixed, one.reference * one.membrane.rest_normals
+    normal, area = one.membrane.rest_normals[within].mT[None], one.membrane.rest_area[within]
+    west = one.membrane.rest[:, 0] < one.membrane.rest[:, 0].median()
+    for pushed in (west, ~west):
+        traction = torch.where(pushed[:, None], -outward, outward)[within].mT[None]
+        share = (area @ pushed[within].double() / area.sum()).item()
+        assert loss.pushed(loss.parts(traction, normal)[2]).item() == pytest.approx(share, abs=0.1)
+    assert loss.pushed(loss.parts(outward[within].mT[None], normal)[2]).item() == 0
+    zero, limit = torch.zeros(2, dtype=torch.float64), SETTINGS.largest_pushed
+    found = one(dented)._replace(misfit=zero, unexplained=zero, pushed=limit + torch.tensor([-0.01, 0.01]).double())
+    assert one.is_explained(found).tolist() == [True, False]
+
+
+def test_what_neighbouring_markers_have_in_common_is_a_reason_to_doubt_what_each_has_alone_is_none():
+    """Off by 1.2 and 1.5 deviations, all alike, but that what is across a ray turns with it; by 50 alike, of which 10 count;
+    every second the other way; each its own way; a quarter alike, the others at rest; that quarter not trusted."""
+    one = estimator()
+    rest, noise = one.equations.bearings.positions, one.equations.bearings.noise
+    ray = torch.nn.functional.normalize(rest, dim=-1)
+    up = torch.tensor([0.0, 1.0, 0.0]).to(ray).expand_as(ray)
+    across = torch.nn.functional.normalize(torch.linalg.cross(ray, up), dim=-1)
+    along = torch.linalg.cross(ray, across)
+    row, column = torch.arange(121) // 11, torch.arange(121) % 11
+    even, part = 1.0 - 2 * ((row + column) % 2), ((row < 5) & (column < 6)).double()
+    own = torch.randn(2, 121, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    alike = torch.stack(
+        [torch.full((121,), 1.2), torch.full((121,), 1.5), torch.full((121,), 50.0), 3 * even, 3 * own[0], 9 * part, 9 * part]
+    )
+    other = torch.zeros(7, 121).double()
+    other[4] = 3 * own[1]
+    depth = noise * rest.norm(dim=-1, keepdim=True)
+    observation = seen(rest + depth * (alike[..., None] * across + other[..., None] * along))
+    observation.confidence[6, part > 0] = 0
+    measured = one.equations.bearings.measured(observation)
+    state = one.at_rest(measured.weight)
+    found = one.equilibrium(*state, state.u, measured)
+    expected = torch.tensor([1.2, 1.5, SETTINGS.far, 0.0]).double()
+    torch.testing.assert_close(found.shared_misfit[:4], expected, rtol=0.06, atol=0)
+    assert found.shared_misfit[4] < 1.0 < found.misfit[4]
+    assert 9 * 0.8 * (30 / 121) ** 0.5 < found.shared_misfit[5] < 9 * (30 / 121) ** 0.5 and found.shared_misfit[6] < 1e-9
+    found = found._replace(misfit=0 * found.misfit, unexplained=0 * found.misfit)
+    assert one.is_explained(found).tolist() == [True, False, False, True, True, False, True]
+
+
+def test_pulls_and_neighbours_that_deviate_alike_add_up_but_for_a_rest_image_that_has_aged(dented):
+    """A press may have six tenths of what is allowed of either, but not of both; a surface that moves by a two-thousandth of
+    its size may have both; none may have more of one than is allowed."""
+    one = estimator()
+    moved = torch.tensor([0.05, 0.05, 0.05, 5e-4, 5e-4, 5e-4]).double()
+    share = torch.tensor([[0.6, 0.3], [0.3, 0.6], [0.6, 0.6], [0.6, 0.6], [1.01, 0.1], [0.1, 1.01]]).double()
+    up = torch.tensor([0.0, 0.0, 1.0]).double()
+    found = one(dented)
+    found = type(found)(*(value[:1].repeat(6, *[1] * (value.ndim - 1)) for value in found))
+    found = found._replace(vertices=one.membrane.rest + one.size * moved[:, None, None] * up)
+    pulls = share[:, 0] * (SETTINGS.largest_unexplained + SETTINGS.unexplained_per_displacement * moved)
+    alike = share[:, 1] * SETTINGS.largest_shared_misfit
+    found = found._replace(unexplained=pulls, shared_misfit=alike, misfit=0 * pulls, pushed=0 * pulls)
+    assert one.is_explained(found).tolist() == [True, True, False, True, False, False]
+
+
+def test_a_press_may_be_further_off_its_markers_than_a_sensor_at_rest(dented):
+    """Just below and just above what a press may be off, and the former of a surface at rest; the model of a grid of half the
+    lines errs four times as much."""
+    for one, error in ((estimator(), 1.0), (estimator(spherical_cap(12, 9, 3, (9, 9))), 4.0)):
+        found = one(dented)
+        moved = (found.vertices[1] - one.membrane.rest).square().sum(-1).mean().sqrt() / one.size
+        largest = (SETTINGS.largest_misfit + SETTINGS.misfit_per_displacement * moved) * error
+        first = type(found)(*(value[1:].repeat(3, *[1] * (value.ndim - 1)) for value in found))
+        vertices = torch.cat([first.vertices[:2], one.membrane.rest[None].to(first.vertices)])
+        first = first._replace(vertices=vertices, misfit=largest * torch.tensor([0.999, 1.001, 0.999]).double())
+        none = 0 * first.objective
+        first = first._replace(objective=none, unexplained=none, shared_misfit=none)
+        assert one.is_explained(first).tolist() == [True, False, False]
+
+
+def test_the_objective_of_a_solution_is_over_the_markers_seen(dented):
+    one = estimator()
+    half = dented._replace(confidence=dented.confidence * (torch.arange(dented.confidence.shape[1]) % 2))
+    for observation in (dented, half):
+        found, measured, seen = one(observation), one.equations.bearings.measured(observation), observation.confidence.sum(-1)
+        state = State(found.vertices - one.membrane.rest, found.pressure, found.moved)
+        traction, normal = one.gauss_newton.tractions(*state[:2])
+        objective = one.gauss_newton.objective(state, traction, normal, measured)
+        pushes = one.equations.loss(traction, normal, measured.noise_level).pushes
+        torch.testing.assert_close(found.objective, objective / seen)
+        torch.testing.assert_close(found.unexplained, (objective - pushes) / seen)

@@ -1,0 +1,51 @@
+"""How the losses become non-convex from step to step: every frame lowers its own scale `tau`, as fast as its surface allows.
+
+The loss of compressive traction is quadratic up to the scale `tau`, and saturates beyond it. If `tau` falls slowly, the steps
+stay in the basin of the one minimum that the smooth problem has (graduated non-convexity, GNC). How slowly it must fall differs
+from frame to frame: while a step still moves the surface far, `tau` falls by a seventh; the less the surface moves, the faster
+`tau` falls. The scale of the markers' loss, the damping of a step and the prior of the camera's motion follow `tau`.
+"""
+
+from typing import TypeVar
+
+from torch import Tensor
+
+Scalar = TypeVar("Scalar", float, Tensor)
+
+RATE = 0.85
+"""Ratio of `tau` to that of the step before while the surface moves by much."""
+STILL = 0.002
+"""Rms displacement in a step, relative to the surface's size, at which `tau` falls by the square of `RATE`."""
+OUTLIER_DECAY_POWER = 1.3
+"""The scale of the markers' loss is proportional to this power of `tau`: it starts at twenty times its last value."""
+LEAST_MOVE = 1e-9
+"""Relative displacement below which a surface stands still; keeps quotients finite."""
+SETTLING_STEPS = 8
+"""Number of damped steps for frames that have not settled before; at most half of all steps."""
+
+
+def falling(moved: Scalar) -> Scalar:
+    """Return the ratio of the next `tau` to the present one after a step with the rms displacement `moved > 0`, `[...]`.
+
+    Example:
+        >>> falling(0.002) == RATE ** 2
+        True
+    """
+    ratio: Scalar = RATE ** (1 + STILL / moved)
+    return ratio
+
+
+def outlier_scale(last: Scalar, ratio: Scalar) -> Scalar:
+    """Return the scale of the markers' loss from its `last` value and the ratio of `tau` to its last value, `[...]`.
+
+    Example:
+        >>> outlier_scale(2.5, 1.0)
+        2.5
+    """
+    scale: Scalar = last * ratio**OUTLIER_DECAY_POWER
+    return scale
+
+
+def settling_of(steps: int) -> int:
+    """Return how many of at most `steps` steps are damped so that a frame settles."""
+    return min(SETTLING_STEPS, steps // 2)
