@@ -4,8 +4,9 @@ python -m bench.accuracy.iterations [--presses 36] [--steps 4 8 16 32 64] [--see
 
 Caps with rim radii of 8 to 40 and random heights, prestretch and fillings, each pressed once on its axis by a ball with a
 radius of 0.1 to 0.2 of the cap's size, 0.05 to 0.2 of it deep, with friction of 0 or 0.3. The markers are where their centres
-are seen, with 0.03 px of noise. Every row takes so many steps on the finest grid, settled or not. Printed: errors of the surface
-at the markers over their displacement and of the force, median, 90 % and worst; with the default settings in the last row.
+are seen, with 0.03 px of noise. Every row takes so many steps on the finest grid, settled or not. Printed: errors of the
+surface at the markers over their displacement and of the force, median, 90 % and worst; with the default settings in the last
+row.
 """
 
 import argparse
