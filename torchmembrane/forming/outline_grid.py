@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
@@ -75,6 +74,8 @@ def outline_grid(points: np.ndarray, lines: int) -> OutlineGrid:
 @torch.inference_mode(False)  # gradients are needed whatever the caller's mode
 @torch.enable_grad()
 def _outline_grid(content: bytes, count: int, lines: int) -> OutlineGrid:
+    from scipy.optimize import minimize  # loads for a quarter of a second, which other sensors need not wait
+
     problem = _GridProblem(np.frombuffer(content).reshape(count, 2), lines)
     z = problem.start()
     blunt = [*BLUNT, 0.0] if problem.smallest(z) <= 0 else [0.0]

@@ -84,8 +84,7 @@ class GaussNewton(nn.Module):
             return tuple(self.native.take(*self._given, state, MeasuredRays(*of_markers), tau, steps))
         found = repeat_rows(self._next, steps - settling, self._begun(*state, tau), of_markers)[:5]
         if settling:
-            best = self._best_so_far(*found)
-            found = repeat_rows(self._next_keeping_best, settling, (*found, *best), of_markers)[5:]
+            found = repeat_rows(self._next_keeping_best, settling, (*found, *self._none_better(*found[1:])), of_markers)[5:]
         return tuple(found[1:])
 
     def with_gradients(self, state: State, measured: MeasuredRays) -> State:
@@ -157,12 +156,12 @@ class GaussNewton(nn.Module):
         return settled, *state, u, (tau * falling(step.clamp_min(LEAST_MOVE))).clamp_min(last)
 
     @traced
-    def _best_so_far(self, done: Tensor, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor) -> tuple[Tensor, ...]:
-        """Return the lowest objective so far, `[B]`, and the state that has it, before the first step of `_next_keeping_best`.
+    def _none_better(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor) -> tuple[Tensor, ...]:
+        """Return the lowest objective so far, `[B]`, and its state, before the first step of `_next_keeping_best`.
 
-        A frame that is `done` keeps its state, because no objective is lower than minus infinity.
+        Frames that have settled take none of its steps, and keep this state.
         """
-        return torch.where(done, -torch.inf, torch.full_like(pressure, torch.inf)), u, pressure, moved, before
+        return torch.full_like(pressure, torch.inf), u, pressure, moved, before
 
     @traced
     def _next_keeping_best(
