@@ -8,7 +8,7 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
-from torchmembrane.solve.implicit import differentiable
+from torchmembrane.solve.implicit import differentiable, differentiable_fixed_point
 from torchmembrane.solve.inverse_root import LARGEST_CONDITION, LEAF, RIDGE, Steps, by_cholesky, by_products, quintics
 from torchmembrane.solve.kkt import constrained_minimum
 
@@ -73,6 +73,42 @@ def test_transforms_of_functions_give_the_gradients_of_a_solution():
     (of_matrix,) = torch.func.vjp(lambda A: solution(A, b), A)[1](weights)
     (expected,) = torch.func.vjp(lambda A: torch.linalg.solve(A, b), A)[1](weights)
     torch.testing.assert_close(of_matrix + of_matrix.mT, expected + expected.mT)
+
+
+def fixed_point(largest, batch=3, n=12):
+    """A linear iteration `x -> x A + c`, not symmetric, with such a largest eigenvalue, and its fixed point `[B, N]`."""
+    generator = torch.Generator().manual_seed(0)
+    V = torch.randn(n, n, generator=generator, dtype=torch.float64) + 2 * torch.eye(n, dtype=torch.float64)
+    A = V @ torch.diag(largest * 0.6 ** torch.arange(n, dtype=torch.float64)) @ torch.linalg.inv(V)
+    c = torch.randn(batch, n, generator=generator, dtype=torch.float64)
+    return A, c, c @ torch.linalg.inv(torch.eye(n, dtype=torch.float64) - A)
+
+
+@pytest.mark.parametrize("largest", [0.5, 0.95, -1.3])
+def test_gradients_of_a_fixed_point_are_the_dense_ones_whatever_its_steps_do(largest):
+    """Fast, slow, and a point from which the steps move away."""
+    A, c, x = fixed_point(largest)
+    A, c = A.requires_grad_(), c.requires_grad_()
+    weights = torch.arange(36, dtype=torch.float64).reshape(3, 12)
+    found = differentiable_fixed_point(lambda x: x @ A + c, x)
+    assert torch.equal(found, x)
+    exact = c @ torch.linalg.inv(torch.eye(12, dtype=torch.float64) - A)
+    expected = torch.autograd.grad((weights * exact**2).sum(), (A, c))
+    got = torch.autograd.grad((weights * found**2).sum(), (A, c), create_graph=True)
+    torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6 * expected[0].abs().max().item())
+    with pytest.raises(MembraneError, match="second derivatives .* differentiated once; expected first ones"):
+        torch.autograd.grad(got[1].square().sum(), c)
+
+
+def test_transforms_of_functions_give_the_gradients_of_a_fixed_point():
+    A, c, x = fixed_point(0.5, batch=1)
+
+    def found(c):
+        return differentiable_fixed_point(lambda x: x @ A + c, x)[0]
+
+    expected = torch.linalg.inv(torch.eye(12, dtype=torch.float64) - A).mT[:, None]
+    torch.testing.assert_close(torch.func.jacrev(found)(c), expected)
+    torch.testing.assert_close(torch.func.grad(lambda c: found(c)[2])(c), expected[2])
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.7])

@@ -89,6 +89,13 @@ def ablation_row(row: dict) -> list[str]:
     return [row["group"], row["label"], *lengths, *shares, str(row["unsettled"])]
 
 
+def iterations(found: dict) -> Rows:
+    """Errors of narrow presses by the number of steps on the finest grid."""
+    head = ["on the finest grid", "surface: median", "90 %", "worst", "force: median", "90 %", "worst"]
+    quantiles = {name: np.quantile(errors, (0.5, 0.9, 1.0), axis=0).T.ravel() for name, errors in found["rows"].items()}
+    return [head, *([name, *(f"{value:.3f}" for value in values)] for name, values in quantiles.items())]
+
+
 def ablation_summary(results: dict) -> dict:
     """The rows without the errors case by case."""
     return results | dict(rows=[{key: value for key, value in row.items() if key != "each"} for row in results["rows"]])

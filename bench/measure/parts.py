@@ -144,6 +144,7 @@ PARTS = {
         "bench.accuracy.views --first 1 --sensors 20 --presses 3 --depth 0.2,0.3", (*RANDOM, "torchmembrane/simulate")
     ),
     "views-soft": Part("bench.accuracy.views --first 40 --sensors 20 --presses 3 --soft", (*RANDOM, "torchmembrane/simulate")),
+    "iterations": Part("bench.accuracy.iterations --seed 11", PRESSED),
     "knocked": Part("bench.accuracy.knocked --first 1 --sensors 10 --presses 3", (*RANDOM, "torchmembrane/simulate")),
     "light": Part("bench.accuracy.range DATA --only light", RANDOM, data="light"),
     "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),

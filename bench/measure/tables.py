@@ -47,6 +47,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = 
     "cli-errors": (("cli-errors",), simulator.cli_errors),
     "memory": (("memory",), simulator.memory),
     "ablation": (("ablation",), accuracy.ablation),
+    "iterations": (("iterations",), accuracy.iterations),
     "light": (("light",), accuracy.light_touches),
     "gauge": (("gauge",), accuracy.gauge),
     "intervals": (("intervals",), accuracy.intervals),
