@@ -161,6 +161,14 @@ def test_each_grid_begins_with_its_scale_and_number_of_steps(dented, monkeypatch
     assert (fine.dent, fine.coarse.coarse.dent) == (None, None) and fine.coarse.dent is not None
 
 
+def test_the_coarsest_of_several_grids_has_its_own_cone():
+    """With which shear under a push is no cheaper than its discretisation error needs."""
+    fine = estimator(spherical_cap(12, 9, 3, (33, 33)))
+    cones = [one.equations.loss.settings.cone for one in (fine, fine.coarse, fine.coarse.coarse)]
+    assert cones == [SETTINGS.cone, SETTINGS.cone, SETTINGS.coarse_cone] and SETTINGS.coarse_cone < SETTINGS.cone
+    assert estimator(spherical_cap(12, 9, 3, (9, 9))).equations.loss.settings.cone == SETTINGS.cone
+
+
 def test_coarser_grids_lose_fewer_markers():
     """Of three grids; the markers' scale begins at twenty times its last, because tau begins at ten times."""
     fine = estimator(spherical_cap(12, 9, 3, (33, 33)))

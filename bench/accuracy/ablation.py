@@ -68,6 +68,7 @@ VARIANTS = [
     *each("longest step", "longest_step", 0.026, 0.06),
     *each("friction", "friction", 0.0, BASE.friction / 4, BASE.friction * 4),
     *each("friction", "cone", 0.0, 40.0),
+    *each("friction", "coarse_cone", 0.0, 23.0),
     *(Variant("energy", model.replace("_", "-"), model=model) for model in ("harmonic", "neo_hookean", "mooney_rivlin")),
     *(Variant("grid", f"{n} x {n}", grid=n) for n in (13, 25)),
     *each("steps", "fine_tau", 0.4, 2.0),

@@ -67,6 +67,7 @@ class ForceBalance(Estimator):
         settings: all other settings.
         rest: the markers' rays at rest with their noise; None: rays from the origin, with `noise`.
         views: number of views that see the markers, which are listed once for each view.
+        is_coarse: whether a finer grid follows.
         levers: vectors from the markers to their visible tips at rest, `[D, 3]`; None: the markers lie on the surface.
 
     Limitations:
@@ -93,6 +94,7 @@ class ForceBalance(Estimator):
         settings: ForceBalanceSettings | None = None,
         rest: Observation | None = None,
         views: int = 1,
+        is_coarse: bool = False,
         levers: Tensor | None = None,
     ):
         settings, spacing = settings or ForceBalanceSettings(), membrane.size / (len(positions) // views) ** 0.5
@@ -104,6 +106,8 @@ class ForceBalance(Estimator):
         bearings = residuals_of(membrane, markers, positions, noise, rest, views, levers)
         self.coarse = self._coarser(elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views, levers=levers)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
+        if is_coarse and self.coarse is None:
+            settings = replace(settings, cone=settings.coarse_cone)
         loss = TractionLoss(membrane, self.reference, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
         self.gauss_newton = GaussNewton(self.equations, self.cavity, settings)
@@ -129,7 +133,7 @@ class ForceBalance(Estimator):
         markers, material = every_second.closest_points(positions.numpy()), elasticity.for_membrane(every_second)
         given = every_second, material, markers, positions, bearings.noise
         settings = replace(self.settings, outlier=self.settings.coarse_outlier)
-        return type(self)(*given, settings=settings, **others)
+        return type(self)(*given, settings=settings, is_coarse=True, **others)
 
     @property
     def must_compile(self) -> bool:

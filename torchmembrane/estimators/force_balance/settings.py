@@ -53,6 +53,7 @@ class ForceBalanceSettings:
         friction: weight of the loss of shear traction, relative to that of compressive traction.
         slip: scale of the loss of shear traction, above which it is linear.
         cone: how much a push reduces the weight of shear.
+        coarse_cone: the same on the coarsest grid, whose discretisation error looks like friction under a contact.
         reach: radius of the neighbourhood that determines whether a vertex is pushed.
         floor: smallest weight of a compressive traction. Without it, the position of a vertex under a contact is undetermined.
         outlier: scale of the markers' loss, relative to their noise.
@@ -102,6 +103,7 @@ class ForceBalanceSettings:
     friction: float = 3.75
     slip: float = 0.05
     cone: float = 23.0
+    coarse_cone: float = 5.0
     reach: float = 0.04
     floor: float = 1e-3
     outlier: float = 2.5
