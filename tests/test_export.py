@@ -278,7 +278,7 @@ def test_edge_runs_without_torch(edge_calls, reconstructor, tracking, images, ba
 
 
 def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, tracking, edge_calls, images, edge):
-    """It says of itself and gives what the model as ONNX does."""
+    """It says of itself and gives what the model as ONNX does, but for rounding: onnxruntime joins other nodes in it."""
     from torchmembrane_edge.images import frames
 
     plain, (done, folder) = edge.Session(model_file), edge_calls
@@ -289,7 +289,9 @@ def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, tracking, e
     for path, results in zip(images, expected, strict=True):
         found = load_frame(folder / f"{path.stem}.npz")
         for name, values in results.items():
-            np.testing.assert_array_equal(found[name], values[0], name)
+            np.testing.assert_allclose(
+                found[name], values[0], rtol=1e-3, atol=1e-5 * max(1.0, np.nanmax(abs(values[0]))), err_msg=name
+            )
 
 
 @pytest.mark.parametrize("kind, shape", [(np.uint8, (5, 7, 3)), (np.uint16, (5, 7)), (np.float32, (5, 7, 3))])

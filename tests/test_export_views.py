@@ -20,8 +20,6 @@ from torchmembrane.simulate.dataset import stroke_to
 
 pytestmark = pytest.mark.full  # an export of two views takes some 90 s of processor time, opening its session 25
 
-SETTINGS = tm.ForceBalanceSettings(steps=(5, 5, 5))
-
 
 @pytest.fixture(scope="module")
 def frames():
@@ -35,8 +33,8 @@ def frames():
 
 @pytest.fixture(scope="module")
 def made(frames, tmp_path_factory):
-    """The reconstructor, of few steps, and its model that follows the dots."""
-    reconstructor, path = tm.Reconstructor(frames[0], settings=SETTINGS), tmp_path_factory.mktemp("views") / "model.onnx"
+    """The reconstructor, and its model that follows the dots."""
+    reconstructor, path = tm.Reconstructor(frames[0]), tmp_path_factory.mktemp("views") / "model.onnx"
     export(reconstructor, path, tracking=True)
     return reconstructor, path, edge.Session(path)
 
@@ -86,7 +84,7 @@ def test_a_model_of_regions_takes_the_image_that_they_share(frames, tmp_path):
     first, other = (whole.in_mode((160 * w, 0, 160, 120)) for w, whole in enumerate(wholes))
     views = View("left", first, is_region=True), View("right", other, BESIDE, is_region=True)
     simulator = Simulator(replace(cap(camera=first), views=views))
-    reconstructor, path = tm.Reconstructor(simulator.at_rest(), settings=SETTINGS), tmp_path / "model.onnx"
+    reconstructor, path = tm.Reconstructor(simulator.at_rest()), tmp_path / "model.onnx"
     export(reconstructor, path)
     session = edge.Session(path)
     assert session.views == () and session.image_sizes == [(320, 120)] and session.mesh["rest_pixels"].shape == (2, 49, 2)
