@@ -49,13 +49,22 @@ def frame_units(frame: dict) -> Rows:
     ]
 
 
+def two_digits(value: float) -> str:
+    """Return a number with two digits, and all digits before the point.
+
+    >>> two_digits(142.3), two_digits(8.83), two_digits(17.2)
+    ('142', '8.8', '17')
+    """
+    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+
+
 def times(row: dict) -> str:
     """Median and least.
 
     >>> times(dict(median=46.1, least=9.66))
     '46 (9.7)'
     """
-    return f"{row['median']:.2g} ({row['least']:.2g})"
+    return f"{two_digits(row['median'])} ({two_digits(row['least'])})"
 
 
 def exported_models(models: dict) -> Rows:
