@@ -98,12 +98,17 @@ def errors(found: tm.Reconstruction, truth: dict) -> tuple[float, float]:
     return float(off), float(np.linalg.norm(found.force[0].numpy() - truth["force"]) / np.linalg.norm(truth["force"]))
 
 
-@pytest.mark.parametrize("depth", [0.08, *(pytest.param(depth, marks=pytest.mark.full) for depth in (0.04, 0.06, 0.2)), 0.31])
-def test_a_pit_in_a_slack_bubble_is_not_taken_for_a_mound(depth):
+SHALLOW = [pytest.param(depth, 0.15, marks=pytest.mark.full) for depth in (0.04, 0.06)]
+
+
+@pytest.mark.parametrize(
+    "depth, largest", [*SHALLOW, (0.08, 0.15), pytest.param(0.2, 0.1, marks=pytest.mark.full), (0.31, 0.1)]
+)
+def test_a_pit_in_a_slack_bubble_is_not_taken_for_a_mound(depth, largest):
     """From hardly visible to nearly a third of the size deep."""
     sensor, truth = pressed_bubble(depth)
     surface, force = errors(solved(tm.Reconstructor(sensor, check_rest=False), truth), truth)
-    assert surface < 0.15 and force < 0.1
+    assert surface < largest and force < 0.1
 
 
 def test_without_the_dent_a_pit_in_a_slack_bubble_is_taken_for_a_mound():

@@ -30,7 +30,7 @@ IMAGE = (640, 480)
 
 
 def random_dome(rng: np.random.Generator) -> tm.Sensor:
-    """A cap that fills the image of a fisheye camera."""
+    """A cap in front of a fisheye camera."""
     radius = float(np.exp(rng.uniform(*np.log([8, 40]))))
     height, near = radius * rng.uniform(0.3, 0.9), radius * rng.uniform(0.4, 1.5)
     surface = Surface("spherical_cap", {"rim_radius": radius, "height": height, "base_z": near})

@@ -74,7 +74,7 @@ def outline_grid(points: np.ndarray, lines: int) -> OutlineGrid:
 @torch.inference_mode(False)  # gradients are needed whatever the caller's mode
 @torch.enable_grad()
 def _outline_grid(content: bytes, count: int, lines: int) -> OutlineGrid:
-    from scipy.optimize import minimize  # loads for a quarter of a second, which other sensors need not wait
+    from scipy.optimize import minimize  # takes long to load, and only these sensors need it
 
     problem = _GridProblem(np.frombuffer(content).reshape(count, 2), lines)
     z = problem.start()

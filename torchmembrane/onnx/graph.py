@@ -143,8 +143,7 @@ class Assembly:
         rows = [
             helper.make_node("Gather", [self.constant(table), f"{k}/step"], [inside[name]]) for name, table in tables.items()
         ]
-        *_, last_output = outputs
-        next_going = f"{k}/on" if going is None else outputs.pop(last_output)
+        next_going = f"{k}/on" if going is None else outputs.pop([*outputs][-1])
         go_on = helper.make_node("Identity", [next_going], [f"{k}/still"])
         kinds = {value.name: value.type.tensor_type.elem_type for value in piece.graph.input}
         counter = [described(f"{k}/step", TensorProto.INT64, []), described(f"{k}/on", TensorProto.BOOL, [])]

@@ -64,6 +64,8 @@ def differentiable_fixed_point(step: Linear, x: Tensor) -> Tensor:
     Limitations:
         As for `differentiable`. They are the gradients of the fixed point as far as `x` has converged to it.
 
+    Reference: Bai, Kolter and Koltun 2019, Deep equilibrium models.
+
     Example:
         >>> a = torch.tensor(0.5, requires_grad=True)
         >>> differentiable_fixed_point(lambda x: a * x + 1, torch.tensor([[2.0]])).sum().backward()
@@ -76,36 +78,20 @@ def differentiable_fixed_point(step: Linear, x: Tensor) -> Tensor:
         for _ in range(UNROLLED_STEPS):
             after = step(after)
         return x + (after - after.detach())
-    fixed: Tensor = _FixedPoint.apply(step(x), x, step)
-    return fixed
 
-
-class _FixedPoint(torch.autograd.Function):
-    """Identity function of `x` whose gradients are those of the fixed point of `step`."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(after: Tensor, x: Tensor, step: Linear) -> Tensor:
-        return x.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Linear], output: Tensor) -> None:
-        after, x, ctx.step = inputs
-        ctx.save_for_backward(after, x)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        after, x = ctx.saved_tensors
+    def adjoint(gradient: Tensor) -> Tensor:
         with torch.enable_grad():
-            _, transposed = torch.func.vjp(ctx.step, x)
+            _, transposed = torch.func.vjp(step, x)
             y, *history = first(gradient, transposed(gradient)[0])
             for _ in range(ADJOINT_STEPS - 1):
                 move = gradient + transposed(y)[0] - y
                 if _is_short(move, gradient):
                     break
                 y, *history = accelerated(y, move, *history)
-        return _Once.apply(y.detach(), gradient, after), None, None
+        return y.detach()
+
+    fixed: Tensor = _Solution.apply(step(x), x, adjoint)
+    return fixed
 
 
 def _is_short(move: Tensor, gradient: Tensor) -> bool:
@@ -117,7 +103,11 @@ def _is_short(move: Tensor, gradient: Tensor) -> bool:
 
 
 class _Solution(torch.autograd.Function):
-    """Identity function of `x` whose gradients are those of `A^-1 residual`."""
+    """Identity function of `x` whose gradient `g` passes `solve(g)` to `residual`.
+
+    For a linear system `residual` is `b - A x`, and `solve` applies `A^-1`. For a fixed point `residual` is `step(x)`, and
+    `solve` solves the adjoint system.
+    """
 
     generate_vmap_rule = True
 
