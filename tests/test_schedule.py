@@ -8,7 +8,17 @@ import torch
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import State
-from torchmembrane.estimators.force_balance.schedule import RATE, SETTLING_STEPS, STILL, falling, outlier_scale, settling_of
+from torchmembrane.estimators.force_balance.schedule import (
+    FIRM,
+    LIGHT,
+    RATE,
+    SETTLING_STEPS,
+    STILL,
+    falling,
+    outlier_scale,
+    scaled_step,
+    settling_of,
+)
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.machine_code import using
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
@@ -66,6 +76,14 @@ def test_the_scale_falls_slowly_while_the_surface_moves_and_fast_where_it_stands
     assert [settling_of(steps) for steps in (1, 2, 9, 16, 64)] == [0, 1, 4, SETTLING_STEPS, SETTLING_STEPS]
 
 
+def test_steps_of_a_light_touch_count_in_proportion_to_its_displacement():
+    moved, displacement = torch.tensor([1e-3, 1e-3, 1e-3, 1e-3]).double(), torch.tensor([0.0, LIGHT, FIRM, 1e6]).double()
+    ratio = FIRM / LIGHT
+    law = torch.tensor([ratio, ((1 + ratio**2) / 2) ** 0.5, (2 / (1 + ratio**-2)) ** 0.5, 1.0]).double()
+    torch.testing.assert_close(scaled_step(moved, displacement), 1e-3 * law)
+    assert [scaled_step(*pair) for pair in zip(moved.tolist(), displacement.tolist())] == pytest.approx((1e-3 * law).tolist())
+
+
 @pytest.fixture
 def taus(monkeypatch):
     """Scales and dampings of every step, as lists over the frames that take it; by tensor operations."""
@@ -74,8 +92,9 @@ def taus(monkeypatch):
 
     def watched(state, measured, tau, damping):
         after = step(state, measured, tau, damping)
-        moved = (after.u - state.u).square().sum(-1).mean(-1).sqrt() / one.size
-        taken.append((tau.tolist(), damping.tolist(), moved.tolist()))
+        moved, far = ((field.square().sum(-1).mean(-1).sqrt() / one.size).tolist() for field in (after.u - state.u, after.u))
+        scaled = [by * ((displacement**2 + FIRM**2) / (displacement**2 + LIGHT**2)) ** 0.5 for by, displacement in zip(moved, far, strict=True)]
+        taken.append((tau.tolist(), damping.tolist(), scaled))
         return after
 
     monkeypatch.setattr(one.gauss_newton, "step", watched)

@@ -224,8 +224,7 @@ class Tracker:
         """Return whether a result of one frame shows a contact that neither a moved camera nor a drift, known from frames
         without contact, explains."""
         moved = self._moved(result)
-        touched = bool(result.contact_points.isfinite().any()) and not self._watch.is_rigid(*moved)
-        return touched and not self._watch.is_near(*moved)
+        return has_contact(result) and not self._watch.is_rigid(*moved) and not self._watch.is_near(*moved)
 
     def _moved(self, result: Reconstruction) -> tuple[Tensor, Tensor]:
         """Return the displacements of the markers from rest, `[N, 2]` px, and their confidence `[N]`, view by view."""
@@ -235,7 +234,7 @@ class Tracker:
     def _look_for_drift(self, result: Reconstruction) -> None:
         moved = self._moved(result)
         if not self.is_pressed(result):
-            self._watch.add(*moved)
+            self._watch.add(*moved, not has_contact(result))
             self._steady.forget()
         else:
             if self._steady.frames >= FEWEST_FRAMES and not self._steady.is_near(*moved):
@@ -270,6 +269,11 @@ class Tracker:
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
+
+
+def has_contact(result: Reconstruction) -> bool:
+    """Return whether a contact is found in a result of one frame."""
+    return bool(result.contact_points.isfinite().any())
 
 
 def press_in_words(force: float, unit: str) -> str:

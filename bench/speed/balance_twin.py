@@ -12,7 +12,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.marker_residuals import MeasuredRays
 from torchmembrane.estimators.force_balance.robust import Cauchy
-from torchmembrane.estimators.force_balance.schedule import LEAST_MOVE, falling, outlier_scale
+from torchmembrane.estimators.force_balance.schedule import LEAST_MOVE, falling, outlier_scale, scaled_step
 from torchmembrane.solve.stencil import inner, pad_border
 from torchmembrane.surface.topology import corners, triangles_of
 
@@ -52,7 +52,8 @@ class BalanceTwin:
         for _ in range(e.steps):
             before = u
             u, pressure = self.step(u, pressure, measured, tau, outlier_scale(e.gauss_newton.settings.outlier, tau / last))
-            moved = float((u - before).square().sum(-1).mean().sqrt()) / e.size
+            lengths = ((field.square().sum(-1).mean().sqrt() / e.size) for field in (u - before, u))
+            moved = scaled_step(*map(float, lengths))
             if tau <= last and moved <= e.settings.settled_step_tol:
                 break
             tau = max(last, tau * falling(max(moved, LEAST_MOVE)))

@@ -99,10 +99,18 @@ class DriftWatch:
         self.frames, self.share, self.square = 0, 0.0, 0.0
         self.mean = torch.zeros(len(self.fields), 2, dtype=torch.float64)
         self.weight = torch.zeros_like(self.mean[:, :1])
+        self.free: Tensor | None = None
 
-    def add(self, displacement: Tensor, confidence: Tensor) -> None:
-        """Add a frame: the markers' displacement from rest `[D, 2]` px, NaN where lost, and their confidence `[D]`."""
+    def add(self, displacement: Tensor, confidence: Tensor, is_free: bool = True) -> None:
+        """Add a frame.
+
+        Args:
+            displacement: displacement of the markers from rest, `[D, 2]` px, NaN where lost.
+            confidence: confidence of the markers, `[D]`.
+            is_free: whether the frame itself shows no contact; otherwise a contact in it is ascribed to drift.
+        """
         moved, found = self._moved(displacement, confidence), (confidence > 0).cpu()[self.seen, None].double()
+        self.free = moved if is_free else self.free
         self.frames += 1
         gain = 1 / min(self.frames, FRAMES_OF_MEAN)
         self.weight = self.weight + gain * (found - self.weight)
@@ -111,10 +119,12 @@ class DriftWatch:
         self.share = (1 - gain) ** 2 * self.share + gain**2
 
     def is_near(self, displacement: Tensor, confidence: Tensor) -> bool:
-        """Return whether a frame's markers are close to their mean positions so far; arguments as for `add`."""
+        """Return whether a frame's markers are close to their mean positions so far, or to those in the latest frame that
+        itself shows no contact; arguments as for `add`."""
         if self.frames < FEWEST_FRAMES:
             return False
-        return self._size(self._coefficients(self._moved(displacement, confidence) - self.mean)) < NEAR_REST
+        moved, places = self._moved(displacement, confidence), (self.mean, self.free)
+        return any(self._size(self._coefficients(moved - place)) < NEAR_REST for place in places if place is not None)
 
     def is_rigid(self, displacement: Tensor, confidence: Tensor) -> bool:
         """Return whether a frame's displacements are explained by a camera motion and noise alone, without contact; arguments

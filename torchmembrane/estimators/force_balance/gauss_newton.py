@@ -18,7 +18,7 @@ from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
-from .schedule import LEAST_MOVE, falling, outlier_scale, settling_of
+from .schedule import LEAST_MOVE, falling, outlier_scale, scaled_step, settling_of
 from .settings import ForceBalanceSettings
 from .traction_loss import LossTerms
 
@@ -60,7 +60,7 @@ class GaussNewton(nn.Module):
     def forward(self, state: State, measured: MeasuredRays, tau: float, steps: int) -> tuple[State, Tensor]:
         """Return the state in which each frame has settled, and the displacement before the last step.
 
-        A frame has settled when a step at the last `tau` is shorter than `settled_step_tol`. Frames that have not settled when
+        A frame has settled when the `scaled_step` at the last `tau` is at most `settled_step_tol`. Frames that have not settled when
         `SETTLING_STEPS` steps are left take these with more damping, and the state with the lowest objective is kept.
 
         Args:
@@ -151,7 +151,7 @@ class GaussNewton(nn.Module):
     ) -> tuple[Tensor, ...]:
         """Take a step in every frame; return whether it has settled, the state, the displacement before, and the next `tau`."""
         state = self._compiled_step(State(u, pressure, moved), MeasuredRays(*of_markers), tau, torch.zeros_like(tau))
-        step, last = self._length(u, state.u), self.settings.tau[1]
+        step, last = self._scaled_step(u, state.u), self.settings.tau[1]
         settled = ~((tau > last) | (step > self.settings.settled_step_tol))
         return settled, *state, u, (tau * falling(step.clamp_min(LEAST_MOVE))).clamp_min(last)
 
@@ -186,13 +186,14 @@ class GaussNewton(nn.Module):
             State(u, pressure, moved), measured, tau, torch.full_like(tau, self.settings.settling_damping)
         )
         objective = self.objective(state, *self.tractions(*state[:2]), measured)
-        settled = ~(self._length(u, state.u) > self.settings.settled_step_tol)
+        settled = ~(self._scaled_step(u, state.u) > self.settings.settled_step_tol)
         best = where_rows(objective < lowest, (objective, *state, u), (lowest, *kept))
         return [settled, *state, u, *best]
 
-    def _length(self, u: Tensor, after: Tensor) -> Tensor:
-        """Return the rms displacement of a step, relative to the size, `[B]`."""
-        return (after - u).square().sum(-1).mean(-1).sqrt() / self.membrane.size
+    def _scaled_step(self, u: Tensor, after: Tensor) -> Tensor:
+        """Return the `scaled_step` between the displacements `u` and `after`, `[B, V, 3]` each, `[B]`."""
+        moved, displacement = ((field.square().sum(-1).mean(-1).sqrt() / self.membrane.size) for field in (after - u, after))
+        return scaled_step(moved, displacement)
 
     def _compiled_step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> State:
         """Take `step` as a region that `torch.compile` traces and compiles only once; the exporter does the same by itself.

@@ -15,17 +15,39 @@ Scalar = TypeVar("Scalar", float, Tensor)
 RATE = 0.85
 """Ratio of `tau` to that of the step before while the surface moves by much."""
 STILL = 0.002
-"""Rms displacement in a step, relative to the surface's size, at which `tau` falls by the square of `RATE`."""
+"""The `scaled_step` at which `tau` falls by the square of `RATE`."""
 OUTLIER_DECAY_POWER = 1.3
 """The scale of the markers' loss is proportional to this power of `tau`: it starts at twenty times its last value."""
+FIRM = 0.008
+"""Rms displacement from rest, relative to the surface's size, of a press that is firm."""
+LIGHT = 4e-4
+"""The same of a touch that is as faint as the markers' noise."""
 LEAST_MOVE = 1e-9
 """Relative displacement below which a surface stands still; keeps quotients finite."""
 SETTLING_STEPS = 8
 """Number of damped steps for frames that have not settled before; at most half of all steps."""
 
 
+def scaled_step(moved: Scalar, displacement: Scalar) -> Scalar:
+    """Return how far a step moves the surface, on the scale by which `tau` falls and a frame settles, `[...]`.
+
+    For a firm press it is the rms displacement in the step, relative to the surface's size. A light touch displaces the whole
+    surface by little, so that all its steps are short on that scale; its steps count in proportion to the displacement from rest.
+
+    Args:
+        moved: rms displacement in the step, relative to the size, `[...]`.
+        displacement: rms displacement from rest after the step, relative to the size, `[...]`.
+
+    Example:
+        >>> scaled_step(1e-5, 0.0)
+        0.0002
+    """
+    scaled: Scalar = moved * ((displacement**2 + FIRM**2) / (displacement**2 + LIGHT**2)) ** 0.5
+    return scaled
+
+
 def falling(moved: Scalar) -> Scalar:
-    """Return the ratio of the next `tau` to the present one after a step with the rms displacement `moved > 0`, `[...]`.
+    """Return the ratio of the next `tau` to the present one after a step with the `scaled_step` `moved > 0`, `[...]`.
 
     Example:
         >>> falling(0.002) == RATE ** 2

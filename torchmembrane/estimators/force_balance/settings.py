@@ -37,7 +37,7 @@ class ForceBalanceSettings:
         steps: largest number of steps on the coarsest grid, the next one, and any finer one; fewer where a frame settles.
         tau: first and last scale of the loss of compressive traction, from rest.
         fine_tau: first scale on all grids but the coarsest.
-        settled_step_tol: rms of a step at the last scale below which a solution has settled.
+        settled_step_tol: largest `schedule.scaled_step` at the last scale with which a solution has settled.
         camera_motion: scale of the prior of the camera's motion relative to the rim at the last tau, px: smaller motions are
             ignored, larger ones are barely penalised further.
         sparsity: twice the loss of the uniform compressive traction p0 on the whole surface, while the loss is quadratic.
@@ -96,7 +96,7 @@ class ForceBalanceSettings:
     scale_share: float = 0.3
     far_share: float = 0.1
     noise_share: float = 0.6
-    contact_noise: float = 3.2
+    contact_noise: float = 3.5
     evidence: float = 0.35
     least_scale: float = 0.02
     decrease: float = 2.0

@@ -12,13 +12,13 @@ from ....mechanics.native_membrane import linearise
 from ....solve.native_band import RANK, ROWS, backward, factor
 from ....solve.symmetric_2x2 import symmetric_solution
 from ..camera_motion import camera_stiffness
-from ..schedule import LEAST_MOVE, falling, outlier_scale
+from ..schedule import LEAST_MOVE, falling, outlier_scale, scaled_step
 from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, sum_blocks, weigh
 from .markers import load_markers
 from .solution import OBJECTIVE, TOLD, solution_of
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
-ratio_of_tau, scale_of_outliers = compiled(falling), compiled(outlier_scale)
+ratio_of_tau, scale_of_outliers, scaled = compiled(falling), compiled(outlier_scale), compiled(scaled_step)
 
 
 @compiled
@@ -31,9 +31,9 @@ def settle(c, work, u, pressure, moved, before, seen, noise_level, gauge, tau, s
         if not done:
             before[:] = u
             step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, 0.0)
-            length = _length(c, u, before)
-            done = not (tau > k.last_tau or length > k.settled_step_tol)
-            tau = max(k.last_tau, tau * ratio_of_tau(max(length, LEAST_MOVE)))
+            moved_by = _scaled_step(c, u, before)
+            done = not (tau > k.last_tau or moved_by > k.settled_step_tol)
+            tau = max(k.last_tau, tau * ratio_of_tau(max(moved_by, LEAST_MOVE)))
     if done or settling == 0:
         return
     lowest, told = np.inf, np.empty(TOLD, u.dtype)
@@ -43,7 +43,7 @@ def settle(c, work, u, pressure, moved, before, seen, noise_level, gauge, tau, s
         if not done:
             before[:] = u
             step(c, work, u, pressure, moved, seen, noise_level, gauge, k.last_tau, k.settling_damping)
-            done = not _length(c, u, before) > k.settled_step_tol
+            done = not _scaled_step(c, u, before) > k.settled_step_tol
             solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, 1.0, told, traction, reference)
             if told[OBJECTIVE] < lowest:
                 lowest = told[OBJECTIVE]
@@ -52,15 +52,16 @@ def settle(c, work, u, pressure, moved, before, seen, noise_level, gauge, tau, s
 
 
 @compiled
-def _length(c, u, before):
-    """Return `GaussNewton._length` of a step."""
-    m, n = c.surface.free.shape
-    total = 0.0
+def _scaled_step(c, u, before):
+    """Return `GaussNewton._scaled_step` of a step."""
+    (m, n), size = c.surface.free.shape, c.numbers.size
+    moved, displacement = 0.0, 0.0
     for i in range(m):
         for j in range(n):
             for a in range(3):
-                total += (u[i, j, a] - before[i, j, a]) ** 2
-    return np.sqrt(total / (m * n)) / c.numbers.size
+                moved += (u[i, j, a] - before[i, j, a]) ** 2
+                displacement += u[i, j, a] ** 2
+    return scaled(np.sqrt(moved / (m * n)) / size, np.sqrt(displacement / (m * n)) / size)
 
 
 @compiled
