@@ -1,4 +1,4 @@
-"""`torchmembrane check`: describe and draw the meaning of a sensor file, and what to expect of the sensor."""
+"""`torchmembrane check`: describe and draw what a sensor file means, and estimate the accuracy of the sensor."""
 
 import os
 import sys
@@ -161,7 +161,7 @@ def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":
     finished = FinishedSeries.resumed(folder, __version__, sensor, arguments.seed or 0, arguments.noise, Effort())
     if finished.outcomes:
         print(
-            f"check --accuracy: goes on from {len(finished.outcomes)} finished series in {finished.path}",
+            f"check --accuracy: continues from {len(finished.outcomes)} finished series in {finished.path}",
             file=sys.stderr,
             flush=True,
         )

@@ -128,7 +128,7 @@ def _plot(folders: list[Path], path: Path) -> None:
     units = {(rows[0]["length_unit"], rows[0]["force_unit"]) for rows in runs.values()}
     if len(units) > 1:
         said = ", ".join(f"{force} and {length}" for length, force in sorted(units))
-        raise MembraneError(f"view --plot: results in {said}; expected folders of the same units")
+        raise MembraneError(f"view --plot: results in {said}; expected folders with the same units")
     save(series_figure(runs), path, "view")
     print(f"{sum(map(len, runs.values()))} frames of {', '.join(runs)} drawn in {path}")
 
@@ -154,7 +154,7 @@ def _draw(arguments: Namespace) -> int:
 
     name, frame, home = read_frame(arguments.result, arguments.frame)
     if arguments.ply:
-        print(f"{name}: {save_contact_cloud(arguments.ply, frame)} points of contact in {arguments.ply}")
+        print(f"{name}: {save_contact_cloud(arguments.ply, frame)} points of the contact written to {arguments.ply}")
         return 0
     mesh = Mesh.load(arguments.mesh or home / MESH)
     mesh.check(frame, arguments.result)

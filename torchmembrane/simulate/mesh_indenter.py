@@ -29,7 +29,7 @@ class MeshIndenter(Indenter):
 
     Args:
         vertices: `[N, 3]`, length unit.
-        triangles: `[M, 3]`, wound outwards.
+        triangles: `[M, 3]`, counterclockwise as seen from outside.
 
     Raises:
         MembraneError: the mesh is not closed, or trimesh is not installed.
@@ -63,7 +63,7 @@ class MeshIndenter(Indenter):
         if not body.is_volume:
             raise MembraneError(
                 f"MeshIndenter: {len(body.vertices)} vertices, {len(body.faces)} triangles, watertight: {body.is_watertight}; "
-                "expected a closed mesh wound outwards: repair it"
+                "expected a closed mesh whose triangles face outwards: repair it"
             )
         object.__setattr__(self, "_body", body)
         object.__setattr__(self, "_normals", _feature_normals(body))
