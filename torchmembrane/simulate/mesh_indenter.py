@@ -83,7 +83,7 @@ class MeshIndenter(Indenter):
         path, expected = Path(path), f"a closed mesh as STL, OBJ or PLY, of at most {MOST_TRIANGLES} triangles"
         kind, trimesh = path.suffix.lower().removeprefix("."), _trimesh()
         if kind not in KINDS:
-            raise MembraneError(f"{path}: no mesh by its name; expected {expected}")
+            raise MembraneError(f"{path}: its name is not that of a mesh; expected {expected}")
         content = read_bytes(path, MOST_BYTES, expected)
         try:
             if kind != "ply":
