@@ -76,7 +76,7 @@ _distance = number_from(-FARTHEST, FARTHEST)
 QUESTIONS = {
     "shape": (f"shape, {' | '.join(DRAFTS)}", _shape),
     "radius": ("radius of the dome, of the cap's rim, or of the cylinder", positive),
-    "height": ("height of the cap, or of the sheet that is blown up, over its rim", _length),
+    "height": ("height of the cap, or of the inflated sheet, over its rim", _length),
     "size": ("size A,B of the rim along x and y", positive_pair("two lengths, A,B")),
     "semi_axes": ("half axes A,B,C of the fingertip along x, y, z", vector),
     "length": ("length of the half cylinder", positive),

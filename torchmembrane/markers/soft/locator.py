@@ -166,7 +166,7 @@ class SoftLocator(nn.Module):
 
     @traced
     def predict_small(self, place: Tensor, weight: Tensor) -> Tensor:
-        """Return the pixels of the small dots, `[B, S, 2]`, predicted from the large ones at `place [B, L, 2]` with `weight [B, L]`."""
+        """Predict the pixels of the small dots, `[B, S, 2]`, from the large ones at `place [B, L, 2]` with `weight [B, L]`."""
         none = self.rest[self.small].expand(place.shape[0], -1, -1)
         flow, weight = self.join(place, none) - self.rest, self.join(weight, torch.zeros_like(none[..., 0]))
         gradient = torch.zeros_like(flow)[..., None].expand(-1, -1, -1, 2)
