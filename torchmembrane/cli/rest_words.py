@@ -43,7 +43,7 @@ def _nearest(shape: RestShape, sheet: NearestSheet | None, sensor: Sensor) -> li
         held, modelled = (pressure_in_words(p, sensor) for p in (sheet.pressure, shape.pressure))
         lines += [
             f"made of the same rubber, that sheet has a pressure of {held}, this membrane {modelled}: if yours is such a",
-            "sheet, depths and forces found with this file are wrong, forces by about as much as the pressures; `init` writes",
+            "sheet, depths and forces by this file are wrong, forces by about as much as these pressures differ; `init` writes",
             'shape = "inflated"',
         ]
     if stretch < sheet.least:
