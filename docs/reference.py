@@ -11,18 +11,20 @@ from torchmembrane.cli.main import command_parser
 HEAD = """\
 # The command
 
-This page lists every option of every command. `torchmembrane COMMAND --help` prints the same. The page is made
-by `python docs/reference.py`.
-`SENSOR.toml` may be `preset:NAME` ([which](presets.md)). Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130
-ended by Ctrl-C, 143 by SIGTERM.
+This page lists every option of every command. `torchmembrane COMMAND --help` prints the same. `python docs/reference.py`
+generates this page.
 
-Ctrl-C and SIGTERM end a command within some two seconds, or with the frame in work; what is done so far is kept. A second one
-ends it at once: files are whole all the same, and the same command goes on from there where it can.
+`SENSOR.toml` may be `preset:NAME`, one of the [presets](presets.md). The exit code is 0 if all went well, 1 if some frames
+failed, 2 for wrong usage, 130 after Ctrl-C, and 143 after SIGTERM.
 
-No command writes over a file that it reads. Another file that is there already is written over with `--force` only, but for
-the results of a folder in which `reconstruct` goes on, the frames of a folder that `simulate` made, and figures that the same
-command drew (their files say so). A symbolic link in a file's place is replaced; what it points to is left alone. Files are
-written whole or not at all.
+Ctrl-C or SIGTERM ends a command within some two seconds, or when the current frame is finished. Finished results are kept. A
+second Ctrl-C or SIGTERM ends the command at once; even then, no file is left half written. The same command, started again,
+continues where it was interrupted, if it can.
+
+No command overwrites a file that it reads. Any other existing file is overwritten only with `--force`. There are three
+exceptions: the results in a folder that `reconstruct` continues, the frames in a folder that `simulate` made, and figures
+that the same command drew (a mark in the file identifies them). If a symbolic link has the name of a file to be written, the
+link is replaced and its target is left alone. Files are written completely or not at all.
 """
 
 

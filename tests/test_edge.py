@@ -641,7 +641,7 @@ OPTIONS = {
     "--camera 0": "--camera with images or --out",
     "--tracking": "unrecognized arguments: --tracking",
     "--pressure gauge.csv": "unrecognized arguments: --pressure",
-    "--providers NoneExecutionProvider": "providers ['NoneExecutionProvider']; expected a list of some of those",
+    "--providers NoneExecutionProvider": "providers ['NoneExecutionProvider']; expected a list of some of the providers",
 }
 
 

@@ -230,7 +230,9 @@ def test_a_recording_that_cannot_be_written_is_told_at_once_and_counted(
     assert main(["live", str(small_sensor / "sensor.toml"), "--camera", "0", "--grid", "7", "7", "--record", str(record)]) == 2
     out, err = capsys.readouterr()
     told = re.search(r"warning: .*/kept/images/(\d+)\.png: not written \(No such file or directory\); .*; frames that", out)
-    counted = re.search(r"recorded in .*kept; 0 frames left out, for want of time, (\d+) frames that could not be kept", out)
+    counted = re.search(
+        r"recorded in .*kept; 0 frames left out, because there was no time for them, (\d+) frames that could not be kept", out
+    )
     assert told and counted and told.start() < out.index("captured") < counted.start()
     results = tm.read_results(record)
     assert int(told[1]) not in map(int, results.names) and int(counted[1]) >= 1

@@ -254,5 +254,5 @@ def test_the_command_says_that_it_goes_on_and_removes_the_file(tried, small_sens
     assert len(json.loads(file.read_text())) == 3 and "what is done so far is kept" in capsys.readouterr().err
     tried.series, tried.interrupt = [], None
     assert cli.main(call) == 0
-    assert f"check --accuracy: goes on from 3 finished series in {file.name}\n" in capsys.readouterr().err
+    assert f"check --accuracy: continues from 3 finished series in {file.name}\n" in capsys.readouterr().err
     assert len(tried.series) == 9 and list(Path().iterdir()) == []

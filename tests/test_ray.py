@@ -102,7 +102,7 @@ def test_a_row_holds_one_image_in_every_form(reconstructor, small_images, form):
         (np.zeros((2, 120, 160, 1), np.uint8), "image is .2, 120, 160, 1.; expected one image a row"),
         (np.zeros((2, 120, 160), np.uint8), "other than one or three channels"),
         (np.zeros((120, 160, 4), np.uint8), "without alpha"),
-        ([[[1], [1, 2]]], "image is a list and no array"),
+        ([[[1], [1, 2]]], "image is a list, not an array"),
         (np.zeros((120, 160), np.int32), "images of type torch.int32"),
         ("a.png", "expected uint8, uint16, or float"),
         (np.float32(1.0), "expected"),

@@ -49,7 +49,7 @@ def test_the_command_writes_the_contact_as_a_cloud_that_others_read(result, tmp_
     touched = frame["vertices"][frame["contact"] > 0.5]
     save_frame(tmp_path / "press.npz", frame)
     assert main(["view", str(tmp_path / "press.npz"), "--ply", str(tmp_path / "press.ply")]) == 0
-    assert f"{len(touched)} points of contact" in capsys.readouterr().out and len(touched) > 0
+    assert f"{len(touched)} points of the contact" in capsys.readouterr().out and len(touched) > 0
     np.testing.assert_allclose(trimesh.load(tmp_path / "press.ply").vertices, touched, rtol=1e-5)
     half = frame | {"contact": np.where(np.arange(81) < 3, 0.5001, 0.5).astype(np.float32)}
     assert save_contact_cloud(tmp_path / "half.ply", half) == 3

@@ -251,7 +251,7 @@ def test_a_folder_of_another_look_or_sensor_is_refused(sensor_path, tmp_path, ca
         ((*SPHERE, "--increment", "1e-9"), "--increment 1e-09: no press"),
         ((*SPHERE, "--dots", "5,9"), "--dots, radii of small and large dots: dots 0 and"),
         ((*SPHERE, "--name", "sensor_rest"), "--name sensor_rest"),
-        (("--indenter", "/etc/passwd", "--depth", "1"), "/etc/passwd: no mesh by its name; expected a closed mesh"),
+        (("--indenter", "/etc/passwd", "--depth", "1"), "/etc/passwd: its name is not that of a mesh; expected a closed mesh"),
     ],
 )
 def test_wrong_calls_give_2_and_a_message_and_no_folder(sensor_path, tmp_path, capsys, options, expected):

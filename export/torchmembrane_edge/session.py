@@ -212,7 +212,7 @@ def grey(images: Any, bits: int | None = None) -> np.ndarray:
 def _refuse_providers(providers: Sequence[str]) -> None:
     there = onnxruntime.get_available_providers()
     if isinstance(providers, str) or not all(isinstance(name, str) and name in there for name in providers):
-        raise EdgeError(f"providers {providers!r}; expected a list of some of those that this onnxruntime has, {there}")
+        raise EdgeError(f"providers {providers!r}; expected a list of some of the providers of this onnxruntime, {there}")
 
 
 def _array(images: Any) -> np.ndarray:

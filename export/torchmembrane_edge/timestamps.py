@@ -1,6 +1,6 @@
-"""Times in names: seconds since 1970, or a date with a time of day.
+"""Read times from file names, given as seconds since 1970 or as a date with a time of day.
 
-torchmembrane and torchmembrane-edge both contain identical copies of this file.
+torchmembrane and torchmembrane-edge contain identical copies of this file.
 """
 
 import math

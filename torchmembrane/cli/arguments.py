@@ -48,18 +48,27 @@ def add_sensor(add: Add) -> None:
 
 def add_estimator(add: Add) -> None:
     """Add the options that choose how the markers and the surface are found."""
-    named = f"{', '.join(ESTIMATORS)}, the name of an installed one, or MODULE:CLASS, your own"
+    named = f"{', '.join(ESTIMATORS)}, the name of an installed estimator, or MODULE:CLASS for your own"
     add("--estimator", metavar="NAME", default=ESTIMATORS[0], help=f"how the surface is found: {named} (default: %(default)s)")
     add("--energy", choices=ENERGIES, help="the membrane's elastic energy (default: the sensor file's)")
-    add("--flow", choices=FLOWS, help="paper: the flow between the markers (default: bilinear)")
-    add("--smoothing", metavar="S", type=positive, help="paper: weight of the smoother (eq. 28; default: 0.1)")
-    how = "how markers are found: least-squares fit, or soft-argmax (default: soft for paper, else fit)"
+    add(
+        "--flow",
+        choices=FLOWS,
+        help="interpolation of the flow between the markers, for the estimator paper (default: bilinear)",
+    )
+    add(
+        "--smoothing",
+        metavar="S",
+        type=positive,
+        help="weight of the smoother (eq. 28), for the estimator paper (default: 0.1)",
+    )
+    how = "how markers are found: by least-squares fit or by soft-argmax (default: soft for paper, else fit)"
     add("--locator", choices=LOCATORS, help=how)
 
 
 def add_force(add: Add) -> None:
     """Add the option that allows existing files to be overwritten."""
-    add("--force", action="store_true", help="write over files that are there; never over those that the command reads")
+    add("--force", action="store_true", help="overwrite existing files, but never those that the command reads")
 
 
 def add_device(add: Add) -> None:
@@ -82,7 +91,7 @@ def check_device(device: str) -> None:
 def add_rerun(add: Add) -> None:
     """Add the options that show frames in the Rerun viewer."""
     add("--rerun", action="store_true", help='show image, surface, contacts, wrench and pressure in Rerun (extra "rerun")')
-    add("--save", metavar="FILE.rrd", type=Path, help="with --rerun: write this file and open no viewer")
+    add("--save", metavar="FILE.rrd", type=Path, help="with --rerun: write this file instead of opening the viewer")
 
 
 def wants_rerun(arguments: Namespace) -> bool:
@@ -92,7 +101,7 @@ def wants_rerun(arguments: Namespace) -> bool:
         MembraneError: `--save` was given without `--rerun`.
     """
     if arguments.save is not None and not arguments.rerun:
-        raise MembraneError(f"--save {arguments.save}: a file of Rerun; expected --rerun with it")
+        raise MembraneError(f"--save {arguments.save}: this option writes a file for Rerun; expected --rerun with it")
     given: bool = arguments.rerun
     return given
 

@@ -6,19 +6,19 @@ from typing import Any
 
 from .arguments import add_command, camera, count, number_from, of_each_view
 
-PURPOSE = "photograph with a camera whose exposure, gain and white balance are held"
+PURPOSE = "take photographs with fixed exposure, gain and white balance"
 EXAMPLES = """\
 examples:
   torchmembrane capture --camera 0 --out rest/ --count 20
-  torchmembrane capture sensor.toml --camera 0 --out weights/ --count 5 --every 10     # put another weight on meanwhile
-  torchmembrane capture --camera left=0 --camera right=2 --out rest/                   # of several views
+  torchmembrane capture sensor.toml --camera 0 --out weights/ --count 5 --every 10     # change the weight in between
+  torchmembrane capture --camera left=0 --camera right=2 --out rest/                   # several views
 
-The camera is opened as `live` opens it, left alone until what it sets by itself has settled, and then held so,
-as far as its driver lets; what cannot be held is said. Most drivers keep the settings until the camera is
-unplugged: `live` then sees what was photographed. The files are named after the time, UTC, of several views
-TIME_VIEW.png.
+The camera is opened in the same way as by `live`. When its automatic settings have settled, they are fixed at their
+values, as far as the driver allows; the command reports settings that cannot be fixed. Most drivers keep the settings
+until the camera is unplugged, so that `live` then uses the same ones. The files are named after the time (UTC); for
+several views, their names are TIME_VIEW.png.
 
-exit code: 0 all taken, 2 wrong usage, or a camera that gives no images (any more)"""
+exit code: 0 all taken, 2 wrong usage, or the camera gives no (more) images"""
 LONGEST = 3600.0
 """Longest time between photographs, seconds."""
 
@@ -26,13 +26,21 @@ LONGEST = 3600.0
 def add_parser(commands: Any) -> None:
     """Add the parser of the command."""
     add = add_command(commands, "capture", run, PURPOSE, EXAMPLES)
-    size = "the sensor file, whose image size is asked for, or preset:NAME (default: the camera's own size)"
+    size = "the sensor file, or preset:NAME; its image size is requested from the camera (default: the camera's own size)"
     add("sensor", metavar="SENSOR.toml", nargs="?", help=size)
-    opened = "a camera, by OpenCV: its number, 0 the first, or its path or address; of several views one each, named"
+    opened = (
+        "the camera, opened by OpenCV: its number from 0, its path or its address; for several views one each, with its name"
+    )
     add("--camera", metavar="[VIEW=]NUMBER|PATH", action="append", required=True, help=opened)
-    add("--out", metavar="DIR", type=Path, required=True, help="folder of the photographs; those that it holds are kept")
-    add("--count", metavar="N", type=count, default=20, help="photographs (default: %(default)s)")
-    add("--every", metavar="SECONDS", type=number_from(0, LONGEST), default=0.0, help="between them, at least (default: none)")
+    add("--out", metavar="DIR", type=Path, required=True, help="folder of the photographs; photographs in it are kept")
+    add("--count", metavar="N", type=count, default=20, help="number of photographs (default: %(default)s)")
+    add(
+        "--every",
+        metavar="SECONDS",
+        type=number_from(0, LONGEST),
+        default=0.0,
+        help="smallest time between two photographs (default: 0)",
+    )
 
 
 def run(arguments: Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`torchmembrane check`: describe and draw the meaning of a sensor file, and what to expect of the sensor."""
+"""`torchmembrane check`: describe and draw what a sensor file means, and estimate the accuracy of the sensor."""
 
 import os
 import sys
@@ -18,23 +18,24 @@ if TYPE_CHECKING:
     from ..sensor.sensor import Sensor
     from ..sensor.working_range import WorkingRange
 
-PURPOSE = "say in words, and draw, what a sensor file means and what to expect of the sensor"
+PURPOSE = "describe and draw what a sensor file means, and estimate the accuracy of the sensor"
 EXAMPLES = """\
 examples:
   torchmembrane check sensor.toml
   torchmembrane check sensor.toml --out sensor.png
   torchmembrane check sensor.toml --overpressure 12hPa
-  torchmembrane check sensor.toml --robot robot      # as URDF and MJCF, with its law of contact
+  torchmembrane check sensor.toml --robot robot      # as URDF and MJCF, with its contact law
   torchmembrane check preset:bubble --accuracy --out bubble.png
 
-The rest surface is tested where it can fail: what tension and pressure leave unbalanced, how far the nearest sheet is that is
-blown up in the same rim, what that holds, what a gauge reads (--overpressure), and what either does to forces.
+The rest surface is tested in three ways: which forces tension and pressure leave unbalanced, how far the surface is from the
+nearest sheet that is inflated in the same rim and which pressure that sheet has, and whether the model's pressure agrees with a
+gauge (--overpressure). The command reports how a difference affects forces.
 
---accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
-errors of force, depth and place, the distance that resolves two contacts, how deep a press may be. It takes some minutes of
-processor time, more for larger images. An interrupted command keeps the finished series of presses in a file
-accuracy-*.unfinished.json beside --out, or else in the current folder. The same command continues from there and removes the
-file at the end. SENSOR.toml may be preset:NAME.
+--accuracy presses the sensor in the simulator and reconstructs some 150 images. It reports the noise at rest, the lightest
+touch that is found, the errors of force, depth and contact point, the smallest distance at which two contacts are resolved,
+and how deep a press may be. It takes some minutes of processor time, more for larger images. An interrupted command keeps the
+finished series of presses in a file accuracy-*.unfinished.json beside --out, or else in the current folder. The same command
+continues from there and removes the file at the end. SENSOR.toml may be preset:NAME.
 
 exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
@@ -43,21 +44,28 @@ def add_parser(commands: Any) -> None:
     """Add the parser of the command."""
     add = add_command(commands, "check", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
+    add(
+        "--out",
+        metavar="FIGURE.png",
+        type=Path,
+        help="draw the sensor: side view with rays, rest surface, rest image, accuracy",
+    )
     add_force(add)
     add(
         "--robot",
         metavar="FOLDER",
         type=Path,
-        help="write it for simulators of robots: URDF, MJCF, meshes (STL), law of contact; SI",
+        help="write the sensor for robot simulators: URDF, MJCF, meshes (STL) and contact law, in SI units",
     )
-    gauge = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa: compared with the model's"
+    gauge = (
+        "reading of a gauge at rest, inside minus outside, with its unit, as 12hPa; it is compared with the model's pressure"
+    )
     add("--overpressure", metavar="P", type=pressure, help=gauge)
-    add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
+    add("--accuracy", action="store_true", help="also make a spec sheet of the sensor from simulated presses")
     add("--seed", type=seed, help="seed of presses and noise of --accuracy (default: 0)")
-    noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
+    noise = "noise of images of --accuracy: ratio of white to its standard deviation (default: as in the rest image, else 40)"
     add("--noise", metavar="DB", type=number_from(0, MOST_DECIBEL), help=noise)
-    add("--jobs", metavar="J", type=count, help="processes of --accuracy (default: all cores)")
+    add("--jobs", metavar="J", type=count, help="number of processes of --accuracy (default: one per core)")
 
 
 def run(arguments: Namespace) -> int:
@@ -153,7 +161,7 @@ def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":
     finished = FinishedSeries.resumed(folder, __version__, sensor, arguments.seed or 0, arguments.noise, Effort())
     if finished.outcomes:
         print(
-            f"check --accuracy: goes on from {len(finished.outcomes)} finished series in {finished.path}",
+            f"check --accuracy: continues from {len(finished.outcomes)} finished series in {finished.path}",
             file=sys.stderr,
             flush=True,
         )

@@ -154,7 +154,7 @@ def _sheet(sensor: Sensor) -> list[str]:
     formed, stretches, unit = surface.formed, energy.rest_stretches, sensor.length_unit
     at, material = formed.outline.camera_frame(np.append(formed.cells.worst, 0.0))[:2], sensor.material
     return [
-        f"a sheet blown up to {formed.height:.4g} {unit} over its rim's plane; its stretches at rest are "
+        f"a sheet inflated to {formed.height:.4g} {unit} over its rim's plane; its stretches at rest are "
         f"{float(stretches.min()):.4g} to {float(stretches.max()):.4g}, without pressure {material.prestretch:g} everywhere",
         f"worst cell of its grid: an angle of {formed.cells.angle:.0f} degrees, near x, y = {_listed(at)}",
     ]

@@ -8,16 +8,17 @@ from typing import Any
 from .arguments import add_command, add_estimator, add_force, add_sensor
 from .progress import ProgressDisplay, announce
 
-PURPOSE = "write image to result as one ONNX model"
+PURPOSE = "write the computation from image to result as one ONNX model"
 EXAMPLES = """\
 examples:
   torchmembrane export sensor.toml -o model.onnx
   torchmembrane export preset:fingertip -o fingertip.onnx --estimator minimum-energy
   torchmembrane export sensor.toml -o video.onnx --tracking
 
-The model takes `image` [batch, 1, height, width], grey in 0..1, and gives the arrays of a NAME.npz, one row per frame;
---tracking, of dots, also previous_pixels: those of the frames before, NaN to look for them from rest.
-To run it without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
+The input of the model is `image` [batch, 1, height, width], grey in 0..1. Its outputs are the arrays of a NAME.npz, one row
+per frame. With --tracking (for dots), it has a second input `previous_pixels`, the pixels of the dots in the preceding
+frames, or NaN to search for them from rest. The package torchmembrane-edge (folder export/) runs the model without torch. The
+command needs pip install "torchmembrane[export]"
 
 exit code: 0 written, 2 wrong usage or sensor file"""
 
@@ -26,10 +27,14 @@ def add_parser(commands: Any) -> None:
     """Add the parser of the command."""
     add = add_command(commands, "export", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
+    add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="file of the model")
     add_force(add)
     add_estimator(add)
-    add("--tracking", action="store_true", help="follow the dots of the frame before, given with the image")
+    add(
+        "--tracking",
+        action="store_true",
+        help="follow the dots from their pixels in the preceding frame, which are given with the image",
+    )
 
 
 def run(arguments: Namespace) -> int:

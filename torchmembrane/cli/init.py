@@ -10,7 +10,7 @@ from ..errors import MembraneError
 from .arguments import Add, add_command, add_force, count, count_pair, number_from, positive, positive_pair, pressure, vector
 from .choices import DRAFTS, FARTHEST, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, OUTLINE, POLARITIES
 
-PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
+PURPOSE = "write a sensor file, with a comment on every key, from a few numbers"
 EXAMPLES = """\
 examples:
   torchmembrane init sensor.toml --shape dome --radius 12 --distance 15 --image-size 640,480 --view 120 --lens fisheye
@@ -18,34 +18,36 @@ examples:
       --overpressure 71hPa --shear-modulus 0.3 --thickness 0.3
   torchmembrane init sensor.toml --shape dome --radius 12 --rest rest.png --rim 322,239,210 --focal 385 --lens fisheye
   torchmembrane init sensor.toml --shape dome --radius 12 --rest rest.png --rim auto --view 120 --lens fisheye
-  torchmembrane init window.toml --shape rectangle --size 50,36 --corner 4 --height 6 --overpressure 12hPa --prestretch 1.1 \
+  torchmembrane init window.toml --shape rectangle --size 50,36 --corner 4 --height 6 --overpressure 12hPa --prestretch 1.1 \\
       --thickness 0.2 --distance 40 --rest rest.png --focal 620
   torchmembrane init window.toml --outline rim.csv --height 6 --distance 40 --rest rest.png --focal 620
   torchmembrane init pair.toml --shape cap --radius 12 --height 6 --distance 40 --rest rest_left.png --focal 800 \\
       --dots dots.csv --views left right=25,0,5
-  torchmembrane init sensor.toml            # on a terminal: asks
+  torchmembrane init sensor.toml            # asks for the numbers, on a terminal
 
-What is needed: the shape and its lengths, the image's size (--image-size, or --rest), a focal length (--focal or --view),
-and how far the rim is before the camera (--distance), which --rim, the rim's circle in the image, gives as well; or with
---distance and --rim the focal length. What is missing is asked for on a terminal.
-The camera looks along the membrane's axis, in the file's frame: origin at the camera's centre of projection, +z towards
-the membrane. Dots are a list (--dots), those found in the rest image (--rest), or a pattern to make (--pitch).
+The command needs the shape and its lengths, the size of the image (--image-size or --rest), the focal length (--focal or
+--view) and the distance of the rim from the camera (--distance). --rim, the rim's circle in the image, can replace
+--distance; or --rim together with --distance can replace the focal length. On a terminal, the command asks for missing
+numbers. The camera looks along the membrane's axis. In the file's frame, the origin is the camera's centre of projection, and
++z points to the membrane. The dots are given as a list (--dots), found in the rest image (--rest), or made as a pattern
+(--pitch).
 
-Dots are a CSV with one of the headers
-  x,y,z          in the camera's frame        x,y,h           h above the rim's plane
-  x,y            from above                   angle,azimuth   degrees from the pole, and about the axis from x to y
-  u,v            px in the image at rest
-each with a further column size, small or large, or without.
+The list of dots is a CSV file with one of the headers
+  x,y,z          in the camera's frame        x,y,h           h is the height above the rim's plane
+  x,y            seen from above              angle,azimuth   degrees from the pole, and about the axis from x to y
+  u,v            px in the rest image
+and, if you like, a further column size, which is small or large.
 
-rectangle, ellipse and --outline are sheets that are stretched in a rim and blown up: their shape is an equilibrium, solved from
-the rim, the prestretch and --height or --overpressure or both. rim.csv holds points once around: x,y from its middle, or x,y,z.
-Of such a sheet height, overpressure, prestretch and shear modulus x thickness any three give the fourth; of the other shapes
-overpressure, prestretch and shear modulus x thickness any two the third. Where all are given and disagree, it is said.
+rectangle, ellipse and --outline are sheets that are stretched in a rim and inflated. Their shape is an equilibrium: it is
+solved from the rim, the prestretch, and --height or --overpressure or both. rim.csv contains points once around the rim: x,y
+from its middle, or x,y,z. For such a sheet, any three of height, overpressure, prestretch and shear modulus x thickness give
+the fourth. For the other shapes, any two of overpressure, prestretch and shear modulus x thickness give the third. If all are
+given and they contradict one another, the command says so.
 
-Of several views (--views) --rest is the first one's image, NAME_VIEW.png, beside which the others' lie: each camera is then
-where its image shows the dots.
+For several views (--views), --rest is the image of the first view, NAME_VIEW.png. The images of the other views lie beside it.
+The pose of each camera then follows from the dots in its image.
 
-SENSOR.toml's files are written beside it. Next: torchmembrane check SENSOR.toml --out sensor.png
+The files that belong to SENSOR.toml are written beside it. Next, run torchmembrane check SENSOR.toml --out sensor.png
 
 exit code: 0 written, 2 wrong usage"""
 ARRAYS = ("heightfield", "grid")
@@ -74,7 +76,7 @@ _distance = number_from(-FARTHEST, FARTHEST)
 QUESTIONS = {
     "shape": (f"shape, {' | '.join(DRAFTS)}", _shape),
     "radius": ("radius of the dome, of the cap's rim, or of the cylinder", positive),
-    "height": ("height of the cap, or of the sheet that is blown up, over its rim", _length),
+    "height": ("height of the cap, or of the inflated sheet, over its rim", _length),
     "size": ("size A,B of the rim along x and y", positive_pair("two lengths, A,B")),
     "semi_axes": ("half axes A,B,C of the fingertip along x, y, z", vector),
     "length": ("length of the half cylinder", positive),
@@ -107,7 +109,8 @@ def _add_membrane(add: Add) -> None:
         "--shape",
         metavar=f"{{{','.join(DRAFTS)}}}",
         type=_shape,
-        help="half a sphere, a cap of one, such a cap of gas, half an ellipsoid, half a cylinder, a sheet blown up in a rim",
+        help="half a sphere, a cap of a sphere, a cap filled with gas, half an ellipsoid, half a cylinder, or a sheet "
+        "inflated in a rim",
     )
     add(
         "--outline",
@@ -123,7 +126,7 @@ def _add_membrane(add: Add) -> None:
         type=positive,
         help="radius of the dome, of the rim of the cap or bubble, or of the half cylinder",
     )
-    height = "of the cap, bubble or blown up sheet, from its rim's plane to its highest point; its unit may follow: 6mm"
+    height = "height of the cap, bubble or inflated sheet above its rim's plane; a unit may follow, as 6mm"
     add("--height", metavar="H", type=_length, help=height)
     add("--semi-axes", metavar="A,B,C", type=vector, help="semi-axes of the fingertip along x, y, z")
     add("--length", metavar="L", type=positive, help="length of the half cylinder, along x")
@@ -136,20 +139,26 @@ def _add_membrane(add: Add) -> None:
 
 
 def _add_camera(add: Add) -> None:
-    depth = "from the camera's centre of projection to the rim's plane; 0 or less of a fisheye that stands within the membrane"
+    depth = (
+        "distance of the rim's plane from the camera's centre of projection; 0 or less if a fisheye camera stands "
+        "within the membrane"
+    )
     add("--distance", metavar="Z", type=_distance, help=depth)
-    add("--lens", choices=LENSES, default=LENSES[0], help="(default: %(default)s)")
+    add("--lens", choices=LENSES, default=LENSES[0], help="model of the lens (default: %(default)s)")
     size = count_pair("two counts, WIDTH,HEIGHT", LONGEST_SIDE)
-    add("--image-size", metavar="WIDTH,HEIGHT", type=size, help="px (default: the rest image's)")
-    add("--focal", metavar="PX", type=positive, help="focal length, px; fisheye: px / rad")
-    add("--view", metavar="DEGREES", type=positive, help="instead of --focal: field of view across the image's width")
+    add("--image-size", metavar="WIDTH,HEIGHT", type=size, help="size of the image, px (default: that of the rest image)")
+    add("--focal", metavar="PX", type=positive, help="focal length, px; for a fisheye lens px / rad")
+    add("--view", metavar="DEGREES", type=positive, help="field of view across the image's width, instead of --focal")
     centre = positive_pair("two numbers, U,V")
     add("--centre", metavar="U,V", type=centre, help="principal point, px (default: the rim's centre, else the image's)")
-    few = "of the camera, where 16-bit images hold fewer, as 10 or 12 (default: 16)"
+    few = "bits that the camera uses of 16-bit images, as 10 or 12 (default: 16)"
     add("--bits", metavar="N", type=count, help=few)
-    further = "name of the first view, and NAME=X,Y,Z of each further camera: about where it stands in the first one's frame"
-    add("--views", metavar="NAME", nargs="+", help=f"{further}; of the same lens, upright, it looks at the membrane's middle")
-    rim = "the rim's circle in the rest image, px, as an image viewer tells it; auto: found in the image"
+    further = (
+        "name of the first view, and NAME=X,Y,Z for each further camera: roughly where it stands, in the first one's frame"
+    )
+    same = "it has the same lens, stands upright and looks at the membrane's middle"
+    add("--views", metavar="NAME", nargs="+", help=f"{further}; {same}")
+    rim = "the rim's circle in the rest image, px, as measured with an image viewer; auto: it is found in the image"
     add("--rim", metavar="U,V,RADIUS|auto", type=_rim, help=rim)
 
 
@@ -159,27 +168,40 @@ def _add_material(add: Add) -> None:
         choices=FILLINGS,
         help="filling of the cavity (default: gas for a bubble or an inflated sheet, else liquid)",
     )
-    prestretch = "of the membrane at rest (default: from the overpressure, else 1.2); of the sheet in its rim (else 1.1)"
-    add("--overpressure", metavar="P", type=pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
+    prestretch = (
+        "prestretch of the membrane at rest (default: from the overpressure, else 1.2), or of the flat sheet in its "
+        "rim (else 1.1)"
+    )
+    add(
+        "--overpressure",
+        metavar="P",
+        type=pressure,
+        help="pressure inside minus outside, at rest, with its unit, as 20hPa, 2kPa, 0.3psi",
+    )
     add("--prestretch", metavar="L", type=positive, help=prestretch)
     add("--shear-modulus", metavar="G", type=positive, help="shear modulus, N / length unit^2: a third of Young's modulus")
     add(
         "--thickness",
         metavar="T",
         type=positive,
-        help="thickness of the membrane at rest, or of the sheet in its rim: unstretched thickness / prestretch^2",
+        help="thickness of the membrane at rest, or of the flat sheet in its rim: unstretched thickness / prestretch^2",
     )
 
 
 def _add_markers(add: Add) -> None:
     add("--rest", metavar="REST.png", help="image of the membrane at rest; without --dots, the dots are found in it")
     add("--dots", metavar="FILE.csv", type=Path, help="list of dots, in one of the frames below")
-    add("--pitch", metavar="LENGTH", type=positive, help="without either: of a pattern of dots along the membrane")
+    add(
+        "--pitch",
+        metavar="LENGTH",
+        type=positive,
+        help="spacing of a pattern of dots on the membrane, without --rest and --dots",
+    )
     add(
         "--polarity",
         choices=POLARITIES,
         default=POLARITIES[0],
-        help="whether dots are darker or lighter than their ground (default: %(default)s)",
+        help="whether dots are darker or lighter than the membrane around them (default: %(default)s)",
     )
 
 

@@ -41,22 +41,23 @@ EXAMPLES = """\
 examples:
   torchmembrane live sensor.toml --camera 0
   torchmembrane live sensor.toml --camera 0 --grid 17 17 --record today
-  torchmembrane live sensor.toml --camera 0 --model video.onnx         # of torchmembrane export --tracking: faster
-  torchmembrane live sensor.toml --video press.mp4                     # at its own pace; --rate 10 for another
+  torchmembrane live sensor.toml --camera 0 --model video.onnx         # from torchmembrane export --tracking
+  torchmembrane live sensor.toml --video press.mp4                     # at its own rate, unless --rate is given
   torchmembrane live sensor.toml --images frames/ --rate 30
-  torchmembrane live pair.toml --camera left=0 --camera right=2        # of several views
+  torchmembrane live pair.toml --camera left=0 --camera right=2        # several views
 
-The newest frame is taken; what came meanwhile is dropped and counted. Latency is from the capture (the camera's
-image is read, a file's is due) to the result. `z` and Enter: nothing touches now, take this for rest. Ctrl-C or
-SIGTERM end it with a summary. In a terminal the line is rewritten in place, elsewhere there is one each second.
+The command always computes the newest frame; frames that arrive in the meantime are dropped and counted. The latency is
+the time from the capture (when a camera's image has been read, or when an image from a file is due) to the result. On a
+terminal, one line is rewritten in place; elsewhere, one line per second is printed. Type `z` and Enter while nothing
+touches the membrane to take the present state as the rest state. Ctrl-C or SIGTERM ends the command with a summary.
 
-A membrane that has softened is seen only with a known load. `200g` and Enter: this weight stands on the middle of the
-membrane now, alone. `12hPa` and Enter: a gauge reads this change since rest now. What is found is compared with it; after
-some comparisons a warning says where a calibration is due.
+Softening of the membrane can be detected only with a known load. Type `200g` and Enter while this weight, and nothing
+else, stands on the middle of the membrane, or `12hPa` and Enter while a gauge reads this change of the pressure since
+rest. The result is compared with the load. After some comparisons, a warning says if a calibration is due.
 
-exit code: 0 ended or stopped, 2 wrong usage, or a source that gives no images (any more)"""
+exit code: 0 ended or stopped, 2 wrong usage, or the source gives no (more) images"""
 MODULUS = (
-    "a membrane that has softened is seen only with a known load: a weight or a gauge's reading, as 200g or 12hPa and Enter"
+    "softening of the membrane can be detected only with a known load: type a weight or a gauge's reading, as 200g or 12hPa"
 )
 SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
@@ -68,19 +69,26 @@ def add_parser(commands: Any) -> None:
     """Add the parser of the command."""
     add = add_command(commands, "live", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    opened = "a camera, by OpenCV: its number, 0 the first, or its path or address; of several views one each, named"
+    opened = (
+        "the camera, opened by OpenCV: its number from 0, its path or its address; for several views one each, with its name"
+    )
     add("--camera", metavar="[VIEW=]NUMBER|PATH", action="append", help=opened)
-    recorded = "a video, as if it came from a camera (extra video); of several views the first one's, NAME_VIEW"
+    recorded = "a video, played like a camera (extra video); for several views that of the first one, NAME_VIEW"
     add("--video", metavar="FILE", type=Path, help=recorded)
-    add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
-    add("--rate", metavar="HZ", type=number_from(0.001, 1e6), help="pace of files (default: a video's own; of images 30)")
+    add("--images", metavar="FOLDER", type=Path, help="a folder of images, played like a camera in the order of their names")
+    add(
+        "--rate",
+        metavar="HZ",
+        type=number_from(0.001, 1e6),
+        help="frames per second of a video or of images (default: the video's own rate; 30 for images)",
+    )
     add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")
-    model = "compute by onnxruntime with a model of torchmembrane export; needs torchmembrane-edge"
+    model = "compute with a model from torchmembrane export in onnxruntime; needs torchmembrane-edge"
     add("--model", metavar="MODEL.onnx", type=Path, help=model)
-    add("--threads", metavar="N", type=count, default=1, help="that compute (default: %(default)s)")
-    kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
+    add("--threads", metavar="N", type=count, default=1, help="number of threads that compute (default: %(default)s)")
+    kept = "store images, results and times in a new folder; frames for which the disk is too slow are dropped and counted"
     add("--record", metavar="DIR", type=Path, help=kept)
-    life = "a file of the largest force and depth of this sensor's life, made where there is none"
+    life = "file with the largest force and depth that this sensor has ever had; it is created if it does not exist"
     add("--life", metavar="FILE.json", type=Path, help=life)
     add_rerun(add)
     add_force(add)
@@ -136,11 +144,13 @@ def _check(arguments: Namespace) -> None:
         came = " and ".join(given) or "no source"
         raise MembraneError(f"live: {came}; expected one of --camera NUMBER, --video FILE, --images FOLDER")
     if arguments.rate is not None and arguments.camera is not None:
-        raise MembraneError("live: --rate with --camera; a camera sets its own rate: leave --rate out")
+        raise MembraneError("live: --rate with --camera; leave --rate out, because a camera sets its own rate")
     foreign = [name for name in OF_TORCH if getattr(arguments, name) is not None]
     foreign += [name for name, default in DEFAULTS.items() if getattr(arguments, name) != default]
     if arguments.model is not None and foreign:
-        raise MembraneError(f"live: --{foreign[0]} with --model; a model contains its own: export it with that option")
+        raise MembraneError(
+            f"live: --{foreign[0]} with --model; a model contains its own settings: export the model with this option"
+        )
     check_device(arguments.device)
 
 
@@ -186,7 +196,7 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
     from .build import build_reconstructor
 
     if arguments.model is not None:
-        print(f"torchmembrane: loading {arguments.model}; this takes some seconds for each MB", file=sys.stderr)
+        print(f"torchmembrane: loading {arguments.model}; this takes some seconds per MB", file=sys.stderr)
         return ModelStream(arguments.model, sensor.fingerprint, arguments.threads)
     torch.set_num_threads(arguments.threads)
     if arguments.grid is not None:
@@ -228,7 +238,7 @@ def _warn(error: BaseException) -> None:
 
 def _left_out(later: "Background[LiveFrame]") -> str:
     failed = f", {later.failed} frames that could not be kept" if later.failed else ""
-    return f"{later.late} frames left out, for want of time{failed}"
+    return f"{later.late} frames left out, because there was no time for them{failed}"
 
 
 @contextmanager

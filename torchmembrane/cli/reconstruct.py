@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .arguments import (
+    Add,
     add_command,
     add_device,
     add_estimator,
@@ -41,12 +42,12 @@ examples:
 DIR then holds
   NAME.npz       the result for the image NAME.png (parquet: the dataset frames/part-*.parquet)
   mesh.npz       rest surface, triangles, units
-  summary.csv    one row per frame; summary_columns.csv says what its columns mean
+  summary.csv    one row per frame; summary_columns.csv explains its columns
   NAME.png       its figure (--figures)
-Frames of a video, of a bag and of an image file that holds several pictures (TIFF, MPO, animated PNG, WebP
-or GIF) are called STEM_000000, STEM_000001 ... The same command again continues after an interruption:
-finished frames are skipped, failed ones, those of damaged results and those whose image has changed are
-done again. In Python, torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
+Frames of a video, of a bag, or of an image file with several pictures (TIFF, MPO, animated PNG, WebP or GIF) are
+named STEM_000000, STEM_000001 ... After an interruption, run the same command again: it skips finished frames, and
+repeats frames that failed, whose result is damaged, or whose image has changed. In Python,
+torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
 
 exit code: 0 all well, 1 some frames failed (see stderr and summary.csv), 2 wrong usage or sensor file"""
 
@@ -60,37 +61,71 @@ def add_parser(commands: Any) -> None:
     add_force(add)
     add_estimator(add)
     add_device(add)
-    add("--batch", metavar="N", type=count_or_auto, help="frames computed at once (default: auto, by the memory there is)")
-    each = "processes of one thread each; 1: none but this one (default: one per core, if there are frames enough)"
+    _add_work(add)
+    _add_measured(add)
+    _add_stored(add)
+
+
+def _add_work(add: Add) -> None:
+    add(
+        "--batch",
+        metavar="N",
+        type=count_or_auto,
+        help="number of frames computed at once (default: auto, chosen from the available memory)",
+    )
+    each = "number of processes, of one thread each; 1: only this process (default: one per core, if there are enough frames)"
     add("--workers", metavar="N", type=count, help=each)
-    where = "this machine (default), or the Ray cluster of RAY_ADDRESS, which writes a Parquet dataset; see docs/clusters.md"
+    where = (
+        "on this machine (default), or on the Ray cluster of RAY_ADDRESS, which writes a Parquet dataset; see docs/clusters.md"
+    )
     add("--engine", choices=ENGINES, default=ENGINES[0], help=where)
-    part = "do the I-th of N disjoint parts of the frames; others may do theirs in the same DIR at the same time"
+    part = (
+        "compute the I-th of N disjoint parts of the frames; other commands may compute the others in the same DIR "
+        "at the same time"
+    )
     add("--shard", metavar="I/N", type=share, default=(1, 1), help=part)
+
+
+def _add_measured(add: Add) -> None:
     add(
         "--video",
         action="store_true",
-        help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are); extra video",
+        help="treat every input as a video (mp4, mov, avi, mkv, webm and gif always are); needs the extra video",
     )
-    of_bags = "of the images in bags of ROS 2 (default: the only one; needs the extra ros); of several views one each, named"
+    of_bags = (
+        "topic of the images in ROS 2 bags (default: the only one; needs the extra ros); for several views one each, "
+        "with its name"
+    )
     add("--topic", metavar="[VIEW=]TOPIC", action="append", default=[], help=of_bags)
-    messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
+    messages = (
+        "also write a bag (a folder) with the results of the bags: wrenches, tractions, and for a gas pressures, in "
+        "N, N m, m and Pa"
+    )
     add("--bag", metavar="BAG", type=Path, help=messages)
-    own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
+    own = (
+        "images of this recording without contact, or first:N for its first N frames; their mean is the rest state "
+        "(default: the sensor's rest image)"
+    )
     add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
     gauge = (
         "a gauge's log, CSV: name or time of a frame, and pressure (across the membrane) or pressure_change (since rest), hPa"
     )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
-    noise = "standard deviation of these, over the rest pressure (default: 0.01)"
+    noise = "standard deviation of these readings, over the rest pressure (default: 0.01)"
     add("--pressure-noise", metavar="SHARE", type=positive, help=noise)
-    one = "one .npz per frame, or one dataset (default: npz; of --engine ray: parquet)"
+
+
+def _add_stored(add: Add) -> None:
+    one = "npz: one .npz per frame; parquet: one dataset (default: npz; with --engine ray parquet)"
     add("--format", choices=RESULT_FORMATS, help=one)
-    principal = "also the principal stretches or tensions (force / length) at the vertices, [V, 2] each (npz)"
+    principal = "also store the principal stretches or tensions (force / length) at the vertices, [V, 2] each (npz only)"
     add("--fields", nargs="+", choices=FIELDS, default=[], help=principal)
-    film = "also a film of all frames in DIR, in name order: .mp4, .mov, .mkv (extra video) or .gif; as view DIR --video-out"
+    film = (
+        "also draw a film of all frames in DIR, in name order: .mp4, .mov, .mkv (extra video) or .gif; as view DIR "
+        "--video-out does"
+    )
     add("--video-out", metavar="FILE", type=Path, help=film)
-    add("--figures", action="store_true", help="also NAME.png: flow, side view and displacement of every frame")
+    add("--figures", action="store_true", help="also draw NAME.png for every frame: flow, side view and displacement")
 
 
 def run(arguments: Namespace) -> int:

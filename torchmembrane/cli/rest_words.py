@@ -27,8 +27,8 @@ def _left_over(shape: RestShape) -> list[str]:
     if shape.left_over < LEFT_OVER:
         return [found]
     return [
-        f"{found}; they are taken for a load that stays",
-        f"expected below {LEFT_OVER:.0%}: a membrane moulded in this shape has such stresses, a blown up sheet has none",
+        f"{found}; the solver treats them as a constant load",
+        f"expected below {LEFT_OVER:.0%}: a membrane moulded in this shape has such stresses, an inflated sheet has none",
     ]
 
 
@@ -37,19 +37,17 @@ def _nearest(shape: RestShape, sheet: NearestSheet | None, sensor: Sensor) -> li
         return []
     unit, stretch = sensor.length_unit, sensor.material.prestretch
     off = f"{sheet.distance:.3g} {unit} rms, at most {sheet.most:.3g}"
-    lines = [f"the nearest sheet that is blown up in this rim, {sheet.height:.4g} {unit} high, lies {off} from this surface"]
+    lines = [f"the nearest sheet that is inflated in this rim, {sheet.height:.4g} {unit} high, lies {off} from this surface"]
     ratio = sheet.pressure / shape.pressure
     if sheet.distance > FAR * sensor.membrane.size or not 1 / ALIKE < ratio < ALIKE:
         held, modelled = (pressure_in_words(p, sensor) for p in (sheet.pressure, shape.pressure))
         lines += [
-            f"of the same rubber that sheet holds {held}, this file's membrane {modelled}: if yours is such a sheet,",
-            "depths and forces by this file are wrong, forces by about as much as these differ, either way; `init` writes",
+            f"made of the same rubber, that sheet has a pressure of {held}, this membrane {modelled}: if yours is such a",
+            "sheet, depths and forces by this file are wrong, forces by about as much as these pressures differ; `init` writes",
             'shape = "inflated"',
         ]
     if stretch < sheet.least:
-        lines.append(
-            f"a prestretch of {stretch:g} at rest is less than what blowing up alone gives such a sheet, {sheet.least:.3g}"
-        )
+        lines.append(f"a prestretch of {stretch:g} at rest is less than inflation alone gives such a sheet, {sheet.least:.3g}")
     return lines
 
 
@@ -60,7 +58,7 @@ def _gauge(shape: RestShape, sensor: Sensor, gauge: float | None) -> list[str]:
     ratio = measured / shape.pressure
     if sensor.force_unit == "relative":
         return [
-            f"from {gauge:g} hPa at rest, this shape and this prestretch follows shear modulus x thickness = {ratio:.4g} "
+            f"{gauge:g} hPa at rest, this shape and this prestretch give shear modulus x thickness = {ratio:.4g} "
             f"N/{sensor.length_unit}"
         ]
     said = f"the gauge reads {gauge:g} hPa at rest, the model has {pressure_in_words(shape.pressure, sensor)}"

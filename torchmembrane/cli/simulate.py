@@ -36,7 +36,7 @@ from .choices import (
 )
 from .progress import announce
 
-PURPOSE = "press a sensor's membrane and render its image, with the truth"
+PURPOSE = "simulate presses of a sensor's membrane and render the images, with the ground truth"
 EXAMPLES = f"""\
 examples:
   torchmembrane simulate preset:fingertip --indenter sphere --radius 4 --depth 2 --direction 0.5,0,0.87 --out press
@@ -50,20 +50,26 @@ SENSOR.toml may be preset:NAME, one of {", ".join(PRESETS)}. Lengths are in the 
 points from the camera to the membrane.
 
 DIR then holds
-  sensor.toml       the sensor as simulated, its rest image in the same light: torchmembrane reconstruct DIR/sensor.toml ...
+  sensor.toml       the simulated sensor and its rest image in the same light: torchmembrane reconstruct DIR/sensor.toml ...
   NAME.png          the image (with --path NAME_000000.png ..., with --video NAME.mp4)
   NAME_truth.npz    surface, dots, forces, pressure (torchmembrane.simulate.simulator.Simulator.frame lists them)
-  sSEED_000000.png ...  and their truths with --random; the same command again continues after an interruption
-                    (parquet: frames/part-*.parquet, rest_truth.npz)
+  sSEED_000000.png ...  with --random, and the truth of each (parquet: frames/part-*.parquet, rest_truth.npz)
+After an interruption, the same command continues a data set.
 
-exit code: 0 all well, 1 some presses of a data set failed, 2 wrong usage, or a press that cannot be"""
+exit code: 0 all well, 1 some presses of a data set failed, 2 wrong usage, or a press that cannot be simulated"""
 
 
 def add_parser(commands: Any) -> None:
     """Add the parser of the command."""
     add = add_command(commands, "simulate", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    add("--out", metavar="DIR", type=Path, required=True, help="folder of frames: new, or of the same sensor and appearance")
+    add(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="folder of the frames: a new one, or one with the same sensor and appearance",
+    )
     add_force(add)
     add("--name", type=file_name, default="press", help="name of the files of a single press (default: %(default)s)")
     _add_press(add)
@@ -74,35 +80,50 @@ def add_parser(commands: Any) -> None:
 def _add_press(add: Add) -> None:
     kinds = ", ".join(INDENTERS)
     mesh = "or a closed mesh that presses along its +z (STL, OBJ, PLY)"
-    add("--indenter", metavar="KIND", help=f"{kinds}, {mesh}; with --random several, a,b,c")
+    add("--indenter", metavar="KIND", help=f"{kinds}, {mesh}; with --random also several, as sphere,box")
     add(
         "--radius", metavar="R", type=positive, help="radius of a sphere or cylinder, or of the rounded edges of a wedge or box"
     )
     add("--sides", metavar="X,Y,Z", type=vector, help="sides of a box; it presses along Z")
     add("--opening", metavar="DEGREES", type=positive, help="opening angle of a wedge")
-    add("--depth", metavar="D", type=positive, help="how far it moves from its first touch")
-    direction = "the side that it comes from, seen from the point it aims at (default: %(default)s, straight at the camera)"
+    add("--depth", metavar="D", type=positive, help="how far the indenter moves from its first touch")
+    direction = "the side from which it comes, seen from the point of --aim (default: %(default)s, straight towards the camera)"
     add("--direction", metavar="X,Y,Z", type=vector, default="0,0,1", help=direction)
-    add("--aim", metavar="X,Y,Z", type=vector, help="the point it moves to (default: the middle of the rim)")
+    add("--aim", metavar="X,Y,Z", type=vector, help="the point to which it moves (default: the middle of the rim)")
     add(
-        "--turn", metavar="DEGREES", type=number_from(-360, 360), default=0.0, help="about its direction (default: %(default)s)"
+        "--turn",
+        metavar="DEGREES",
+        type=number_from(-360, 360),
+        default=0.0,
+        help="rotation about its direction (default: %(default)s)",
     )
     friction = number_from(0, MOST_FRICTION)
-    add("--friction", metavar="MU", type=friction, default=0.0, help="Coulomb's coefficient (default: %(default)s)")
+    add("--friction", metavar="MU", type=friction, default=0.0, help="Coulomb's coefficient of friction (default: %(default)s)")
 
 
 def _add_sequence(add: Add) -> None:
-    add("--slide", metavar="X,Y,Z", type=vector, help="how it moves after the press")
+    add("--slide", metavar="X,Y,Z", type=vector, help="motion of the indenter after the press")
     legs = some_of(LEGS, f"legs of {', '.join(LEGS)}, as push,slide,release")
-    add("--path", metavar="LEGS", type=legs, help=f"all frames along a path, of {', '.join(LEGS)}, as in push,slide,release")
+    add(
+        "--path",
+        metavar="LEGS",
+        type=legs,
+        help=f"simulate all frames along a path whose legs are {', '.join(LEGS)}, as push,slide,release",
+    )
     add("--frames", metavar="N", type=count, default=10, help="frames on each leg of --path (default: %(default)s)")
-    add("--video", action="store_true", help="--path as NAME.mp4 instead of images (extra video)")
-    add("--random", metavar="N", type=count, help="a data set of N random presses")
+    add("--video", action="store_true", help="write the frames of --path as NAME.mp4 instead of images (extra video)")
+    add("--random", metavar="N", type=count, help="simulate a data set of N random presses")
     add("--seed", type=seed, default=0, help="seed of presses and noise (default: %(default)s)")
-    add("--jobs", metavar="J", type=count, default=os.cpu_count(), help="processes of --random (default: all cores)")
-    stored = "of --random: png and npz files, or a Parquet data set (extra parquet)"
+    add(
+        "--jobs",
+        metavar="J",
+        type=count,
+        default=os.cpu_count(),
+        help="number of processes of --random (default: one per core)",
+    )
+    stored = "format of --random: png and npz files, or a Parquet data set (extra parquet)"
     add("--format", choices=SIMULATION_FORMATS, default=SIMULATION_FORMATS[0], help=stored)
-    add("--increment", metavar="D", type=positive, help="longest motion in one step (default: from the size)")
+    add("--increment", metavar="D", type=positive, help="longest motion in one step (default: a share of the membrane's size)")
 
 
 def _add_appearance(add: Add) -> None:
@@ -110,22 +131,27 @@ def _add_appearance(add: Add) -> None:
         "--noise",
         metavar="DB",
         type=number_from(0, MOST_DECIBEL),
-        help="white over the noise's standard deviation (default: no noise)",
+        help="noise: ratio of white to its standard deviation (default: no noise)",
     )
-    highlight = "specular over diffuse light (default: %(default)s)"
+    highlight = "ratio of specular to diffuse light (default: %(default)s)"
     add("--highlight", metavar="SHARE", type=number_from(0, 1), default=HIGHLIGHT, help=highlight)
-    blur = "defocus, standard deviation (default: %(default)s)"
+    blur = "standard deviation of the blur by defocus (default: %(default)s)"
     add("--blur", metavar="PX", type=number_from(0, MOST_BLUR), default=BLUR, help=blur)
     radii, grid = positive_pair("two radii, SMALL,LARGE"), count_pair("two counts of vertices, M,N", MOST_LINES)
     add(
         "--dots",
         metavar="SMALL,LARGE",
         type=radii,
-        help="their radii (default: 0.16 and 0.27 of the spacing)",
+        help="radii of the dots (default: 0.16 and 0.27 of the spacing)",
     )
     missing = numbers("numbers of dots, as 0,17,18")
-    add("--missing", metavar="I,J", type=missing, default=(), help="dots that are not painted, from 0")
-    add("--grid", metavar="M,N", type=grid, help="grid of the equilibrium (default: 38 per side, or finer than the sensor's)")
+    add("--missing", metavar="I,J", type=missing, default=(), help="numbers of dots that are not painted, counted from 0")
+    add(
+        "--grid",
+        metavar="M,N",
+        type=grid,
+        help="grid on which the equilibrium is solved (default: 38 per side, or finer than the sensor's grid)",
+    )
 
 
 def run(arguments: Namespace) -> int:
@@ -148,13 +174,13 @@ def _check_options(arguments: Namespace) -> None:
         raise MembraneError("--name sensor_rest: the sensor's rest image has this name; expected another one")
     if arguments.random:
         if extra := given("depth", "slide", "path", "aim", "radius", "sides", "opening"):
-            raise MembraneError(f"--{extra[0]} does not go with --random, whose presses are drawn")
+            raise MembraneError(f"--{extra[0]} does not go with --random, which draws presses at random: leave it out")
         return
     if missing := {"indenter", "depth"} - set(given("indenter", "depth")):
         raise MembraneError(f"--{sorted(missing)[0]} is missing; expected a press, as --indenter sphere --radius 4 --depth 2")
     if arguments.format != SIMULATION_FORMATS[0]:
         raise MembraneError(f"--format {arguments.format} goes with --random only")
     if arguments.video and not arguments.path:
-        raise MembraneError("--video needs a --path, as push,slide,release")
+        raise MembraneError("--video without --path; add a path, as --path push,slide,release")
     if arguments.path and "slide" in arguments.path and arguments.slide is None:
         raise MembraneError(f"--path {','.join(arguments.path)} needs --slide X,Y,Z")

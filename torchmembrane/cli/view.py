@@ -18,44 +18,52 @@ EXAMPLES = """\
 examples:
   torchmembrane view results/press.npz --out press.png
   torchmembrane view results/press.npz --image press.png
-  torchmembrane view results --frame press          # of a folder of either format; without --frame its first
+  torchmembrane view results --frame press          # from a folder of either format; default: its first frame
   torchmembrane view results/frames/part-00000.parquet
-  torchmembrane view results --video-out press.mp4 --images frames/        # all its frames, in name order; or press.gif
-  torchmembrane view results --plot forces.png      # over time; results day2/ --plot: side by side
-  torchmembrane view results --sheet sheet.png      # all its frames, small
-  torchmembrane view results --rerun                # likewise, in the viewer Rerun; --save press.rrd: in a file
-  torchmembrane view results --dataset press        # a data set as Hugging Face's datasets loads it, with a card
-  torchmembrane view results --frame press --ply press.ply   # the contact as a point cloud, nothing drawn
+  torchmembrane view results --video-out press.mp4 --images frames/        # all frames, in name order; or press.gif
+  torchmembrane view results --plot forces.png      # over time; `results day2/ --plot ...`: side by side
+  torchmembrane view results --sheet sheet.png      # all frames, small
+  torchmembrane view results --rerun                # all frames, in the viewer Rerun; with --save press.rrd in a file
+  torchmembrane view results --dataset press        # a data set for Hugging Face's datasets, with a card
+  torchmembrane view results --frame press --ply press.ply   # the contact as a point cloud, without a figure
 
-Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
+Without --out, a window is opened. If there is no display, NAME_view.png is written beside the results."""
 
 
 def add_parser(commands: Any) -> None:
     """Add the parser of the command."""
     add = add_command(commands, "view", run, PURPOSE, EXAMPLES)
-    what = "a frame's result NAME.npz, a part of a Parquet dataset, or a folder; with --plot several folders"
+    what = "the result of a frame, NAME.npz, a part of a Parquet dataset, or a folder; with --plot also several folders"
     add("result", metavar="RESULT", type=Path, nargs="+", help=what)
-    add("--frame", metavar="NAME", help="which frame of a folder or a part (default: the first)")
-    add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of its folder (default: mesh.npz beside it)")
+    add("--frame", metavar="NAME", help="name of the frame in a folder or a part (default: the first)")
+    add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of the results (default: mesh.npz beside them)")
     add("--image", metavar="IMAGE", type=Path, help="the frame's image, drawn behind the flow")
-    add("--out", metavar="FILE.png", type=Path, help="where to draw it (default: in a window, if there is a display)")
-    plot = "draw force, moment and pressure of a folder's frames over time, of several folders side by side"
+    add("--out", metavar="FILE.png", type=Path, help="file of the figure (default: a window, if there is a display)")
+    plot = "draw force, moment and pressure of a folder's frames over time; several folders side by side"
     add("--plot", metavar="FILE.png", type=Path, help=plot)
-    add("--sheet", metavar="FILE.png", type=Path, help=f"draw a folder's frames small, on one sheet, {MOST_FRAMES} at most")
+    add("--sheet", metavar="FILE.png", type=Path, help=f"draw at most {MOST_FRAMES} frames of a folder, small, on one sheet")
     film = "draw all frames of a folder, one after another: .mp4, .mov, .mkv (extra video) or .gif"
     add("--video-out", metavar="FILE", type=Path, help=film)
-    add("--rate", metavar="HZ", type=positive, default=DEFAULT_RATE, help="frames per second of that (default: %(default)g)")
-    pictures = "where the images of all frames are, by the frames' names (default: RESULT/images, as live --record has it)"
+    add(
+        "--rate",
+        metavar="HZ",
+        type=positive,
+        default=DEFAULT_RATE,
+        help="frames per second of --video-out (default: %(default)g)",
+    )
+    pictures = (
+        "folder of the images of all frames, named like the frames (default: RESULT/images, where live --record stores them)"
+    )
     add("--images", metavar="FOLDER", type=Path, help=pictures)
     add_rerun(add)
     add(
         "--dataset",
         metavar="FOLDER",
         type=Path,
-        help="write all frames and their images as a data set of Hugging Face (extra parquet)",
+        help="write all frames and their images as a data set for Hugging Face's datasets (extra parquet)",
     )
     add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
-    mesh = "write the whole surface as a mesh, .ply or .vtk, with what --fields kept of it, and draw nothing"
+    mesh = "write the whole surface as a mesh, .ply or .vtk, with the fields that --fields stored, and draw nothing"
     add("--surface", metavar="FILE", type=Path, help=mesh)
     add_force(add)
 
@@ -120,7 +128,7 @@ def _plot(folders: list[Path], path: Path) -> None:
     units = {(rows[0]["length_unit"], rows[0]["force_unit"]) for rows in runs.values()}
     if len(units) > 1:
         said = ", ".join(f"{force} and {length}" for length, force in sorted(units))
-        raise MembraneError(f"view --plot: results in {said}; expected folders of the same units")
+        raise MembraneError(f"view --plot: results in {said}; expected folders with the same units")
     save(series_figure(runs), path, "view")
     print(f"{sum(map(len, runs.values()))} frames of {', '.join(runs)} drawn in {path}")
 
@@ -146,7 +154,7 @@ def _draw(arguments: Namespace) -> int:
 
     name, frame, home = read_frame(arguments.result, arguments.frame)
     if arguments.ply:
-        print(f"{name}: {save_contact_cloud(arguments.ply, frame)} points of contact in {arguments.ply}")
+        print(f"{name}: {save_contact_cloud(arguments.ply, frame)} points of the contact written to {arguments.ply}")
         return 0
     mesh = Mesh.load(arguments.mesh or home / MESH)
     mesh.check(frame, arguments.result)

@@ -126,7 +126,7 @@ def bulge_inwards(x: Tensor, normals: Tensor, membrane: Membrane) -> Tensor:
 
 
 def bulge_regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:
-    """Return the region number of each vertex, `[B, V]`, 0 for none, from `bulge [B, V]`: the strongest `count` regions."""
+    """Return the region number of each vertex, `[B, V]`, from `bulge [B, V]`; it is 0 outside the `count` strongest regions."""
     on_grid = bulge.float().unflatten(-1, membrane.grid)  # single precision is enough to compare heights
     return persistent_regions(on_grid, count, LEAST_BULGE * membrane.size).flatten(1)
 

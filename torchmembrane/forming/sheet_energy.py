@@ -54,7 +54,7 @@ class SheetEnergy(ElasticEnergy):
             self.register_buffer(name, value)
 
     def for_membrane(self, membrane: Membrane) -> "SheetEnergy":
-        """Return the energy of the same sheet on every second grid line."""
+        """Return the energy of the same sheet for `membrane`, whose grid consists of every second line of this one."""
         sheet = self.sheet.unflatten(0, self.grid)[::2, ::2].flatten(0, 1)
         return SheetEnergy(membrane, sheet, self.model, float(self.prestretch), self.modulus, self.c2_ratio)
 

@@ -106,7 +106,7 @@ def _bounded_yaml(yaml: Any) -> Any:
                 if number > MOST_EVENTS or depth > DEEPEST:
                     raise ValueError(f"YAML of more than {MOST_EVENTS} values, or of more than {DEEPEST} levels")
                 if isinstance(event, AliasEvent):
-                    raise ValueError("YAML with references, which no recording writes")
+                    raise ValueError("YAML with references, which recordings do not contain")
             return super().load(stream)
 
     return BoundedYaml

@@ -44,7 +44,7 @@ def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstru
     if shard != WHOLE:
         raise MembraneError("--bag with --shard: leave --bag out, and write the bag by one more call when all shards are done")
     if not inputs.bags:
-        raise MembraneError(f"--bag {path}: none of the inputs is a bag; expected one, whose times the results take")
+        raise MembraneError(f"--bag {path}: none of the inputs is a bag; expected one, because the results take its times")
     if not reconstructor.finds_tractions:
         raise MembraneError(f"--bag {path}: {mesh.estimator} finds no forces; expected force-balance")
     return BagWriter(path, SiUnits(mesh, reconstructor.sensor.gas_pressure), is_mcap(inputs.bags[0]))

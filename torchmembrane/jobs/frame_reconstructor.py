@@ -223,7 +223,7 @@ def _rows(columns: Any) -> Iterator[tuple[Any, Any, Any]]:
             "read_images(..., include_paths=True)"
         )
     if min(lengths.values(), default=0) < count:
-        raise MembraneError(f"FrameReconstructor: columns of different lengths, {lengths}; expected a value a row in each")
+        raise MembraneError(f"FrameReconstructor: columns of different lengths, {lengths}; expected one value per row in each")
     none = [None] * count
     return zip(*(columns[key] if key in columns else none for key in ("path", "image", "bytes")), strict=True)
 
@@ -241,7 +241,7 @@ def _array(image: Any) -> np.ndarray:
     try:
         return np.asarray(image)
     except (ValueError, TypeError, RuntimeError) as error:
-        raise MembraneError(f"image is a {_kind(image)} and no array ({in_one_line(error)})") from error
+        raise MembraneError(f"image is a {_kind(image)}, not an array ({in_one_line(error)})") from error
 
 
 def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:

@@ -59,7 +59,7 @@ class PressureReadings(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """Largest time between a frame and a reading that is used for it, s."""
+        """Largest time difference, in s, at which a reading is used for a frame."""
         return max(REACH, INTERVALS * float(np.median(np.diff(self.times)))) if len(self.times) > 1 else REACH
 
     def plus(self, offset: float) -> "PressureReadings":

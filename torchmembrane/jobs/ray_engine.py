@@ -34,7 +34,9 @@ class RayEngine:
         paths = []
         for source in waiting:
             if source.origin is not None:
-                raise MembraneError(f"{source.file}: --engine ray takes image files of one picture; leave it out for videos")
+                raise MembraneError(
+                    f"{source.file}: --engine ray reads only image files with a single picture; leave it out for videos"
+                )
             paths.append(printable(str(source.file)))
         if work.figures:
             raise MembraneError("--figures: --engine ray draws none; use `torchmembrane view DIR --frame NAME`")

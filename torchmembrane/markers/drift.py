@@ -1,15 +1,16 @@
-"""Detection of drift: whether the markers still rest where expected, from their running mean over frames without contact.
+"""Detection of drift: whether the markers without contact are still where the rest image shows them.
 
-Temperature, creep, swelling, pressure or a moved camera displace all markers slightly, as a smooth field. The mean displacement
-of frames without contact, whitened by the frozen noise of the rest image, is projected on polynomials of the image position:
-`S` is the sum of squares of these `k` coefficients, `U` that of the remainder. With noise alone, `S / v` follows a chi-squared
-distribution with k degrees of freedom, where `v = 1 + share x scatter` adds the noise that remains in the frames' mean. With a
-harmless drift of `LEAST_DRIFT`, the distribution is noncentral, with parameter `lambda`. Therefore
+Temperature, creep, swelling, pressure or a moved camera displace all markers slightly, as a smooth field. The running mean of
+the displacements in frames without contact is whitened by the noise of the rest image, which is the same in all frames, and
+projected on polynomials of the image position. `S` is the sum of squares of the `k` coefficients, and `U` is that of the
+remainder. With noise alone, `S / v` follows a chi-squared distribution with k degrees of freedom, where
+`v = 1 + share x scatter` adds the noise that remains in the mean of the frames. With a harmless drift of `LEAST_DRIFT`, the
+distribution is noncentral, with parameter `lambda`. Therefore
 
     z = (S / v - k - lambda) / sqrt(2 k + 4 lambda)
 
-is the number of standard deviations beyond both. A contact that is too light to be detected moves only the markers near it and
-leaves a large `U`.
+is the number of standard deviations by which `S` exceeds what noise and a harmless drift explain. A contact that is too light
+to be detected moves only the markers near it and leaves a large `U`.
 """
 
 from typing import NamedTuple

@@ -57,7 +57,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], rate: float, la
     """Write pictures as a film, atomically.
 
     Args:
-        path: `.gif`, or a video (H.264): `.mp4`, `.mov`, `.mkv`; its folder is made if need be.
+        path: `.gif`, or a video (H.264): `.mp4`, `.mov`, `.mkv`; its folder is created if needed.
         pictures: RGB `[height, width, 3]` uint8, at least one, all of the same size.
         rate: pictures per second.
         last: additional seconds for which a GIF shows the last picture before it starts again.

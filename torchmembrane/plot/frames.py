@@ -41,17 +41,17 @@ BAR_BELOW, BAR_HEIGHT, BAR_WIDTH = 0.52, 0.11, 3.8  # inches: of a colour bar, b
 def figure(
     frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None, name: str = "", places: int | None = None
 ) -> Figure:
-    """Flow over the image, side view, displacement along the rest normals and, where forces are known, traction.
+    """Draw a frame: flow over the image, side view, displacement along the rest normals and, if forces are known, traction.
 
     Args:
-        frame: one frame's arrays, as `Reconstruction.frame` gives them.
-        mesh: the `Mesh` stored beside it.
-        image: its image `[height, width]` in 0..1; without one, none is drawn.
+        frame: arrays of the frame, as `Reconstruction.frame` returns them.
+        mesh: the `Mesh` of the results.
+        image: image of the frame, `[height, width]` in 0..1, drawn behind the flow; None: no image.
         name: name of the frame, for the title.
-        places: for panels, 4 or 3; default: as many as there are. Films need figures of one size.
+        places: number of places for panels, 4 or 3; default: the number of panels. All figures of a film need the same number.
 
     Returns:
-        A figure of three panels, or four; of a frame without a surface its flow in their place, and the reason in words.
+        A figure with three or four panels. For a frame without a surface, it has only the flow, and the reason as its title.
 
     Example:
         >>> from dataclasses import replace

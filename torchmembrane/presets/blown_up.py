@@ -159,7 +159,7 @@ def _split(product: float, thickness: float | None, modulus: float | None, unit:
 
 def _in_words(formed: FormedSurface, unit: str) -> list[str]:
     return [
-        f"rest shape: a sheet blown up to {formed.height:.4g} {unit} over its rim, on a grid whose smallest angle is "
+        f"rest shape: a sheet inflated to {formed.height:.4g} {unit} over its rim, on a grid whose smallest angle is "
         f"{formed.cells.angle:.0f} degrees"
     ]
 

@@ -27,7 +27,7 @@ ELSE = {"pressure": "not measured", "fields": "none"}
 
 
 class ResultMaker(Protocol):
-    """The interface of a `Reconstructor` that a folder of results needs."""
+    """The attributes of a `Reconstructor` that are needed to write a folder of results."""
 
     sensor: Any
     estimator: Any

@@ -307,9 +307,9 @@ def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:
         return
     came = f"Sensor: rest_image is {size[0]} x {size[1]} px and image_size {list(camera.image_size)}"
     if mode is None:
-        raise MembraneError(f"{came}; expected the same: where the camera's mode crops or bins, give crop and binning")
+        raise MembraneError(f"{came}; expected the same size; if the camera crops or bins, add crop and binning")
     how = f"of crop {list(mode.crop)} and binning {list(mode.binning)}"
-    raise MembraneError(f"{came} {how}; expected the same, or the calibrated {list(mode.image_size)}")
+    raise MembraneError(f"{came} {how}; expected the same size, or the calibrated {list(mode.image_size)}")
 
 
 def _expect_positive(**values: float | None) -> None:

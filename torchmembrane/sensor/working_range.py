@@ -38,7 +38,7 @@ class WorkingRange(NamedTuple):
         """Read a range that `to_file` has written.
 
         Raises:
-            MembraneError: the file cannot be read, or is not such a file.
+            MembraneError: the file cannot be read, or does not contain a working range.
         """
         table = Table.from_file(path)
         table.allow(cls._fields)

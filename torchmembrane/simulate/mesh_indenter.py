@@ -29,7 +29,7 @@ class MeshIndenter(Indenter):
 
     Args:
         vertices: `[N, 3]`, length unit.
-        triangles: `[M, 3]`, wound outwards.
+        triangles: `[M, 3]`, counterclockwise as seen from outside.
 
     Raises:
         MembraneError: the mesh is not closed, or trimesh is not installed.
@@ -63,7 +63,7 @@ class MeshIndenter(Indenter):
         if not body.is_volume:
             raise MembraneError(
                 f"MeshIndenter: {len(body.vertices)} vertices, {len(body.faces)} triangles, watertight: {body.is_watertight}; "
-                "expected a closed mesh wound outwards: repair it"
+                "expected a closed mesh whose triangles face outwards: repair it"
             )
         object.__setattr__(self, "_body", body)
         object.__setattr__(self, "_normals", _feature_normals(body))
@@ -83,7 +83,7 @@ class MeshIndenter(Indenter):
         path, expected = Path(path), f"a closed mesh as STL, OBJ or PLY, of at most {MOST_TRIANGLES} triangles"
         kind, trimesh = path.suffix.lower().removeprefix("."), _trimesh()
         if kind not in KINDS:
-            raise MembraneError(f"{path}: no mesh by its name; expected {expected}")
+            raise MembraneError(f"{path}: its name is not that of a mesh; expected {expected}")
         content = read_bytes(path, MOST_BYTES, expected)
         try:
             if kind != "ply":

@@ -16,21 +16,21 @@ from ..progress import announce
 
 PURPOSE = "find lens, ports, rest surface and dots from images; make a layout of dots"
 CONTENT = """
-SENSOR.toml holds the design; it may be preset:NAME. DIR then holds
-  sensor.toml    the sensor as calibrated, with its files
-  report.json    what was found, standard deviations, correlations
-  report.png     residuals and what goes with them"""
+SENSOR.toml may be preset:NAME. DIR then holds
+  sensor.toml    the calibrated sensor, with its files
+  report.json    the values found, their standard deviations and correlations
+  report.png     a figure of the fit, with its residuals"""
 ORDER = """\
 A sensor is calibrated in this order, each step starting from the sensor file of the one before:
-  camera     lens, from a checkerboard in air, ports not mounted
-  ports      distance, thickness and index of flat layers, from a board of dots, in air and in the medium
-  rest       where the rest surface stands, and its dots, from the rest image, when the dots are listed; and
-             where further views stand
-  views      the same from several views, when they are not
-  depth      the same from a depth image
-  material   prestretch from images of presses; stiffness, where forces, or pressures in the cavity, of some are known
-and the other way round:
-  layout     from the dots wanted in the image to positions on the rest surface, to fabricate them"""
+  camera     finds the lens, from a checkerboard in air, before the ports are mounted
+  ports      finds distance, thickness and index of flat layers, from a board of dots, in air and in the medium
+  rest       finds the pose of the rest surface, its dots, and the poses of further views, from the rest image, if the
+             dots are listed
+  views      finds rest surface and dots from several views, if the dots are not listed
+  depth      finds rest surface and dots from a depth image, if the dots are not listed
+  material   finds the prestretch from images of presses, and the stiffness if forces or pressures of some are known
+The last step goes in the opposite direction:
+  layout     computes positions on the rest surface, for fabrication, from the dots wanted in the image"""
 
 
 def add_parser(commands: Any) -> None:
@@ -46,14 +46,14 @@ def add_parser(commands: Any) -> None:
     for name, step in STEPS.items():
         example = f"example:\n  torchmembrane calibrate {name} {step.example}\n{CONTENT}"
         add = add_command(steps, name, partial(_run, step.module, name), step.purpose, example, *step.aliases)
-        add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the step before")
+        add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the preceding step")
         step.add_options(add)
         add(
             "--out",
             metavar="DIR",
             type=Path,
             required=True,
-            help="folder for the calibrated sensor; not that of SENSOR.toml",
+            help="folder for the calibrated sensor; not the folder of SENSOR.toml",
         )
         add_force(add)
 
@@ -68,36 +68,51 @@ def _run(module: str, step: str, arguments: Namespace) -> int:
 
 
 def _view_option(add: Add, whose: str) -> None:
-    add("--view", metavar="NAME", help=f"of a sensor with several views, the one {whose}")
+    add("--view", metavar="NAME", help=f"for a sensor with several views: the view {whose}")
 
 
 def _camera_options(add: Add) -> None:
     corners = count_pair("two counts, COLUMNS,ROWS")
-    add("images", metavar="IMAGES", nargs="+", help="images of the checkerboard in different poses, filling the image")
+    add("images", metavar="IMAGES", nargs="+", help="images of the checkerboard in different poses; it should fill the image")
     add("--corners", metavar="COLUMNS,ROWS", type=corners, required=True, help="inner corners of the checkerboard")
     add("--square", metavar="LENGTH", type=positive, required=True, help="side of its squares, in the sensor's unit")
-    _view_option(add, "whose lens is to be found, by its images of the checkerboard")
+    _view_option(add, "whose lens is to be found, from its images of the checkerboard")
 
 
 def _ports_options(add: Add) -> None:
     add("--air", metavar="IMAGES", nargs="+", default=[], help="images of the board of dots through the ports, before filling")
     add("--medium", metavar="IMAGES", nargs="+", default=[], help="images of the same board in the medium")
-    add("--dots", metavar="COLUMNS,ROWS", type=count_pair("two counts, COLUMNS,ROWS"), required=True, help="dots of the board")
+    add(
+        "--dots",
+        metavar="COLUMNS,ROWS",
+        type=count_pair("two counts, COLUMNS,ROWS"),
+        required=True,
+        help="number of dots of the board",
+    )
     add("--pitch", metavar="LENGTH", type=positive, required=True, help="pitch of its dots, in the sensor's unit")
     add(
         "--radius",
         metavar="LENGTH",
         type=positive,
-        help="radius of dots (default: 0.22 pitches; the three marks: 1.7 times that)",
+        help="radius of the dots (default: 0.22 pitches); that of the three large ones is 1.7 times as large",
     )
-    add("--held", metavar="NAME", nargs="+", choices=PORTS, default=[], help=f"taken as known: {', '.join(PORTS)}")
+    add(
+        "--held",
+        metavar="NAME",
+        nargs="+",
+        choices=PORTS,
+        default=[],
+        help="values of the sensor file that are known and stay as they are",
+    )
     _view_option(add, "through whose ports the images were taken")
 
 
 def _rest_options(add: Add) -> None:
-    at_rest = "image of the membrane at rest; of several views the first one's, NAME_VIEW, or the image whose regions they are"
+    at_rest = (
+        "image of the membrane at rest; for several views that of the first one, NAME_VIEW, or the image whose regions they are"
+    )
     add("image", metavar="REST.png", help=at_rest)
-    gauge = "of an inflated surface: what a gauge reads at rest, inside over outside, with its unit, as 12hPa"
+    gauge = "for an inflated surface: reading of a gauge at rest, inside minus outside, with its unit, as 12hPa"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
 
 
@@ -106,11 +121,13 @@ def _views_options(add: Add) -> None:
         "images",
         metavar="IMAGES",
         nargs="+",
-        help="images of the membrane at rest; the first by the camera as it is in the sensor; of a sensor with several views "
-        "one of each, NAME_VIEW, or the image whose regions they are",
+        help="images of the membrane at rest; the first with the camera in its place in the sensor; for a sensor with several "
+        "views one image of each, NAME_VIEW, or the image whose regions they are",
     )
-    where = "CSV x,y,z,turn_x,turn_y,turn_z: where the camera was for each image, roughly, in its first frame; degrees"
-    where += "; not for a sensor with several views, in whose file the poses are"
+    where = (
+        "CSV x,y,z,turn_x,turn_y,turn_z: approximate pose of the camera for each image, in its first frame; rotation in degrees"
+    )
+    where += "; not for a sensor with several views, whose file contains the poses"
     add("--motions", metavar="FILE.csv", type=Path, help=where)
     scale = "standard deviation of the second camera's distance from the first, which sets the scale, in the sensor's unit"
     scale += " (default: 0.01 mm)"
@@ -118,11 +135,17 @@ def _views_options(add: Add) -> None:
 
 
 def _depth_options(add: Add) -> None:
-    where = ".npy, TIFF or 16-bit PNG, registered to the camera: z along the axis; 0, NaN or infinite where there is none"
+    where = (
+        "depth image registered to the camera, .npy, TIFF or 16-bit PNG: z along the axis; 0, NaN or infinite where "
+        "there is no depth"
+    )
     add("depth", metavar="DEPTH", type=Path, help=where)
-    step = "of one step of its values, in the sensor's unit (default: of images of 16 bits 1 mm, else that unit)"
+    step = "unit of the depth values, in the sensor's unit (default: 1 mm for 16-bit images, else the sensor's unit)"
     add("--unit", metavar="LENGTH", type=positive, help=step)
-    at_rest = "the membrane at rest, to find the dots in; of several views the first one's, NAME_VIEW, or the shared image"
+    at_rest = (
+        "image of the membrane at rest, in which the dots are found; for several views that of the first one, "
+        "NAME_VIEW, or the shared image"
+    )
     add("--image", metavar="REST.png", required=True, help=at_rest)
     _view_option(add, "to whose camera the depth image is registered")
 
@@ -130,23 +153,26 @@ def _depth_options(add: Add) -> None:
 def _material_options(add: Add) -> None:
     add("images", metavar="IMAGES", nargs="+", help="images of deep presses: files, globs, folders")
     vectors, lengths = "CSV image,fx,fy,fz (on the membrane, in the camera's frame)", "image,force (magnitude)"
-    table = f"{vectors} or {lengths}, N: total force in some images; each with a further column deviation or without"
+    table = (
+        f"{vectors} or {lengths}, N: total force in some of the images; a column deviation with their standard "
+        "deviations may follow"
+    )
     add("--forces", metavar="FILE.csv", type=Path, help=table)
     gauge = (
         "a gauge's log, CSV: name or time of an image, and pressure (at rest and pressed) or pressure_change (since rest), hPa"
     )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
-    at_rest = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa; goes with the others"
+    at_rest = "reading of a gauge at rest, inside minus outside, with its unit, as 12hPa; can be combined with the others"
     add("--overpressure", metavar="P", type=pressure, help=at_rest)
-    sure = "standard deviation of the rest surface's height over its rim, relative (default: %(default)s)"
+    sure = "relative standard deviation of the rest surface's height over its rim (default: %(default)s)"
     add("--rest-error", metavar="SHARE", type=number_from(1e-3, MOST_HEIGHT_ERROR), default=HEIGHT_ERROR, help=sure)
-    lies = "that lies on the membrane, alone, in every image that --forces does not list, as 200g or 1.96N"
+    lies = "weight that lies alone on the membrane in every image that --forces does not list, as 200g or 1.96N"
     add("--weight", metavar="WEIGHT", type=weight, help=lies)
 
 
 def _layout_options(add: Add) -> None:
-    add("--pixels", metavar="FILE.csv", type=Path, help="the wanted dots: u,v,size (small | large)")
-    add("--pitch", metavar="PX", type=positive, help="a square lattice of this pitch within the rim's outline")
+    add("--pixels", metavar="FILE.csv", type=Path, help="CSV of the wanted dots: u,v,size (small | large)")
+    add("--pitch", metavar="PX", type=positive, help="use a square lattice of this pitch within the rim's outline instead")
 
 
 class Step(NamedTuple):
@@ -174,7 +200,7 @@ STEPS = {
     ),
     "rest": Step(
         "surface",
-        "find the rest surface's pose and its dots from a rest image of listed dots; of several views their poses, too",
+        "find the rest surface's pose, its dots, and the poses of further views from a rest image of listed dots",
         _rest_options,
         "ports/sensor.toml rest.png --out rest",
     ),

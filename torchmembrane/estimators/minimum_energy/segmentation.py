@@ -71,7 +71,7 @@ class PolarAngle(nn.Module):
         return self.rest - polar_angle(directions)
 
     def bulge(self, directions: Tensor) -> Tensor:
-        """Return the change times the range, positive where the membrane bulges inwards, `[..., N]`."""
+        """Return the change of the polar angle times the range, positive where the membrane bulges inwards, `[..., N]`."""
         return self.sign * self.range * self.change(directions)
 
 

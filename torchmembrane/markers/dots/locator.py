@@ -119,11 +119,11 @@ class DotLocator(nn.Module):
     Limitations:
         The flow may change by at most about half a pitch from one dot to the next. Matches are wrong where the spacing is below
         about half of that at rest, where the middle of the pattern turns by more than about 30 degrees relative to its outline,
-        or where a part of it moves by more than 2.5 pitches. Most such regions end in a seam and are lost with their vicinity;
-        the remaining ones are off by a whole pitch with high confidence, more often for patterns of one size. A lattice that
-        moves as a whole by one of its steps is distinguished from one at rest by its outline alone: by the dots that are lost,
-        and found, there. A blob of its size beside a missing dot may be mistaken for it. If many dots are missing (20 %) and
-        there are as many false ones, correct dots are lost as well.
+        or where a part of it moves by more than 2.5 pitches. Most such regions end in a seam and are lost with their vicinity.
+        The others are off by a whole pitch with high confidence; this is more frequent if all dots have the same size. If a
+        lattice moves as a whole by one lattice step, only its outline shows the motion: dots are lost on one side, and blobs
+        without a dot appear on the other. A blob beside a missing dot may be mistaken for it if it has the same size. If many
+        dots are missing (20 %) and there are as many false ones, correct dots are lost as well.
 
     Example:
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)

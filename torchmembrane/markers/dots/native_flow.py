@@ -127,7 +127,7 @@ KEPT_STEPS = {function: Kept(function, SOURCES, 3) for function in (gradients, f
 
 
 def is_native(*values: Tensor) -> bool:
-    """Whether machine code takes the step of these tensors."""
+    """Return whether machine code computes the step of the matching for these tensors."""
     return all(value.dtype == torch.float32 for value in values) and takes(*values)
 
 

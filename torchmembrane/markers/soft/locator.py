@@ -131,11 +131,11 @@ class SoftLocator(nn.Module):
 
         Args:
             image: `[B, 1, H, W]`, grey in 0..1.
-            previous: pixels `[B, D, 2]` in the frames before, NaN where lost, from which the growth starts; without it
-                from the rim.
+            previous: pixels `[B, D, 2]` in the preceding frames, NaN for lost dots, from which the search grows; without it,
+                the search grows from the rim.
 
         Returns:
-            The dots. A frame that holds a value that is not finite has confidence 0 throughout.
+            The dots. If a frame contains a value that is not finite, all its confidences are 0.
         """
         levels, usable = self.begin(image)
         place, weight = self.growth(levels, None if previous is None else self.of_large(previous))
@@ -145,14 +145,14 @@ class SoftLocator(nn.Module):
 
     @traced
     def begin(self, image: Tensor) -> tuple[list[Tensor], Tensor]:
-        """The pyramid, and which frames are usable `[B]`."""
+        """Return the pyramid, and which frames are usable, `[B]`."""
         finite = image.isfinite()
         dark = torch.where(finite, 1 - image if self.polarity == "light" else image, 0.0)
         return self.levels(dark), finite.flatten(1).all(1)
 
     @traced
     def of_large(self, values: Tensor) -> Tensor:
-        """Of values `[B, D, ...]` those of the large dots."""
+        """Return the values of the large dots from those of all dots, `[B, D, ...]`."""
         return values[:, self.large]
 
     def levels(self, dark: Tensor) -> list[Tensor]:
@@ -161,12 +161,12 @@ class SoftLocator(nn.Module):
 
     @traced
     def join(self, large: Tensor, small: Tensor) -> Tensor:
-        """Values of all dots in the pattern's order, from those of the large and of the small ones `[B, ...]`."""
+        """Return values of all dots in the pattern's order, from those of the large and of the small dots, `[B, ...]`."""
         return torch.cat([large, small], 1)[:, self.order]
 
     @traced
     def predict_small(self, place: Tensor, weight: Tensor) -> Tensor:
-        """Where the large dots at `place [B, L, 2]` px, of `weight [B, L]`, predict the small ones: `[B, S, 2]` px."""
+        """Predict the pixels of the small dots, `[B, S, 2]`, from the large ones at `place [B, L, 2]` with `weight [B, L]`."""
         none = self.rest[self.small].expand(place.shape[0], -1, -1)
         flow, weight = self.join(place, none) - self.rest, self.join(weight, torch.zeros_like(none[..., 0]))
         gradient = torch.zeros_like(flow)[..., None].expand(-1, -1, -1, 2)
@@ -176,7 +176,7 @@ class SoftLocator(nn.Module):
 
     @traced
     def find_small(self, levels: list[Tensor], predicted: Tensor) -> Tensor:
-        """Pixels `[B, S, 2]` of the small dots about `predicted [B, S, 2]` px, on a coarse level."""
+        """Return the pixels `[B, S, 2]` of the small dots, found on a coarse level around `predicted [B, S, 2]` px."""
         assert self.by_large is not None
         return self.by_large(self.by_large.response.maps(levels), predicted).place
 

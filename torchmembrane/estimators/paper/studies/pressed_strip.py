@@ -139,7 +139,7 @@ class PressedStrip:
         return strip.tension(self.stretch) / self.free_radius
 
     def forces(self, strip: Strip) -> np.ndarray:
-        """Return the force of each disc on the strip, per length of the axis, `[I, 2]`: it balances tension and pressure."""
+        """Return the force of each disc on the strip per length along the axis, `[I, 2]`; it balances tension and pressure."""
         tension, pressure = strip.tension(self.stretch), self.pressure(strip)
         forces = []
         for before, arc, after in zip(self.arcs[::2], self.arcs[1::2], self.arcs[2::2], strict=False):
