@@ -366,7 +366,7 @@ def weights(estimator, force, tau=0.5):
     """Weight of the normal and of one tangential direction at every inner vertex, over that of a small push."""
     _, normal = at_rest(estimator)
     loss = estimator.equations.loss
-    loss.settings = replace(SETTINGS, least_scale=1.0)  # tractions over p0
+    loss.push_noise = torch.full_like(loss.area, 1e6)  # tractions over p0
     W = loss.weights(normal.mT, force.mT, ONE, tau * ONE)[0].movedim(-1, 0)
     along = torch.nn.functional.normalize(along_y(normal), dim=-1)
     scale = SETTINGS.sparsity / (estimator.reference * estimator.size) ** 2 / loss.area
@@ -533,7 +533,8 @@ def test_the_example_images_give_shape_force_and_place():
 def test_the_loss_of_normal_tractions_has_the_derivative_that_the_weights_say():
     estimator = make()
     membrane, p0 = estimator.membrane, estimator.reference
-    loss = TractionLoss(membrane, p0, replace(SETTINGS, floor=0.0, least_scale=1.0))
+    loss = TractionLoss(membrane, p0, replace(SETTINGS, floor=0.0))
+    loss.push_noise = torch.full_like(loss.area, 1e6)  # tractions over p0
     loss.surroundings = torch.eye(len(loss.area), dtype=torch.float64)
     normal = inner(membrane.rest_normals, membrane.grid).mT[None]
     level = p0 * torch.linspace(-1.5, 0.5, normal.shape[-1], dtype=torch.float64)

@@ -50,7 +50,7 @@ def test_a_touch_looks_the_same_whatever_its_scale(shear):
     """The loss is that of tractions over what is around: a hundredth of the tractions weighs ten thousand times as much."""
     estimator = make(17)
     loss = estimator.equations.loss
-    loss.settings, loss.push_noise = replace(SETTINGS, least_scale=1e-6), 0 * loss.push_noise
+    loss.push_noise = 0 * loss.push_noise
     _, normal = at_rest(estimator)
     force, _ = push(estimator, (3.0, 0.0, 11.5), 0.5, shear=shear)
     strong, light = (loss.weights(normal.mT, share * force, ONE, SETTINGS.tau[1] * ONE) for share in (1.0, 0.01))

@@ -91,7 +91,7 @@ class BalanceTwin:
         move = np.zeros(count)
         move[free] = -Mg - rise * Mm - multiplier * Mn
         move = move.reshape(-1, 3)
-        share = min(1.0, e.settings.longest_step * e.size / np.linalg.norm(move, axis=1).max())
+        share = 1.0
         surface, change = (a.reshape(*e.membrane.grid, 3) for a in (x[0].numpy(), move))
         for axis in (0, 1):
             edge, turn = (np.linalg.norm(np.diff(a, axis=axis), axis=-1) for a in (surface, change))

@@ -210,7 +210,7 @@ class GaussNewton(nn.Module):
         return tuple(self.step(state, measured, tau, damping))
 
     def step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> State:
-        """Take one reweighted Gauss-Newton step with linearised volume, limiting the longest step of a vertex.
+        """Take one reweighted Gauss-Newton step with linearised volume, limiting the stretch of an edge.
 
         Args:
             state: state before the step.
@@ -260,14 +260,10 @@ class GaussNewton(nn.Module):
         return torch.stack([multiplier, one, rise], 1)
 
     def _share(self, u: Tensor, move: Tensor) -> Tensor:
-        """Return the factor `[B]` that scales a step `move [B, 3, m, n]`, to limit the motion of vertices and the stretch of
-        the grid's edges."""
-        settings, tiny = self.settings, torch.finfo(u.dtype).tiny
+        """Return the factor `[B]` that scales a step `move [B, 3, m, n]`, to limit the stretch of the grid's edges."""
+        tiny = torch.finfo(u.dtype).tiny
         both = torch.stack([move, (self.membrane.rest + u).mT.unflatten(-1, self.membrane.grid)], 1)
-        far2 = move.square().sum(1).flatten(1).amax(-1) / (settings.longest_step * self.membrane.size) ** 2
-        for axis in (-2, -1):
-            change2, edge2 = both.diff(dim=axis).square().sum(2).unbind(1)
-            stretch2 = (change2 / edge2.clamp_min(tiny)).flatten(1).amax(-1)
-            far2 = torch.maximum(far2, stretch2 / settings.largest_stretch**2)
-        share: Tensor = far2.clamp_min(1.0).rsqrt()
+        changes = [both.diff(dim=axis).square().sum(2).flatten(2).unbind(1) for axis in (-2, -1)]
+        stretch2 = torch.cat([change2 / edge2.clamp_min(tiny) for change2, edge2 in changes], 1).amax(-1)
+        share: Tensor = (stretch2 / self.settings.largest_stretch**2).clamp_min(1.0).rsqrt()
         return share

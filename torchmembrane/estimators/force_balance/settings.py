@@ -48,8 +48,6 @@ class ForceBalanceSettings:
         contact_noise: smallest ratio of a contact's push to the push due to noise; it must be large for its neighbourhood too.
         evidence: smallest decrease of the objective from the surface at rest for a solution to have contacts, relative to the
             mean decrease due to the markers' noise alone.
-        least_scale: smallest scale of tractions, relative to p0.
-        decrease: how fast that scale may fall with tau.
         friction: weight of the loss of shear traction, relative to that of compressive traction.
         slip: scale of the loss of shear traction, above which it is linear.
         cone: how much a push reduces the weight of shear.
@@ -60,7 +58,6 @@ class ForceBalanceSettings:
         coarse_outlier: the same on coarser grids, which must not reject markers because of their discretisation error.
         pressure_noise: standard deviation of a measured pressure, relative to the reference traction (mostly the rest
             pressure). Use this value for better gauges as well.
-        longest_step: largest step of a vertex.
         largest_stretch: largest relative change of an edge of the grid in one step.
         damping: relative increase of the diagonal of a step's matrix at the last tau; it is proportional to the square of tau.
         settling_damping: the same in the last steps of frames that have not settled (`schedule.SETTLING_STEPS`).
@@ -93,13 +90,11 @@ class ForceBalanceSettings:
     camera_motion: float = 0.005
     sparsity: float = 9000.0
     scale_reach: float = 0.08
-    scale_share: float = 0.3
-    far_share: float = 0.1
+    scale_share: float = 0.2
+    far_share: float = 0.05
     noise_share: float = 0.6
     contact_noise: float = 3.5
     evidence: float = 0.35
-    least_scale: float = 0.02
-    decrease: float = 2.0
     friction: float = 3.75
     slip: float = 0.05
     cone: float = 23.0
@@ -109,7 +104,6 @@ class ForceBalanceSettings:
     outlier: float = 2.5
     coarse_outlier: float = 5.0
     pressure_noise: float = 0.01
-    longest_step: float = 0.04
     largest_stretch: float = 0.3
     damping: float = 3e-7
     settling_damping: float = 1e-3

@@ -120,7 +120,7 @@ class TractionLoss(nn.Module):
         around = top * (((compression2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
         noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
         expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
-        least = (settings.decrease * (tau / last - 1) + settings.least_scale).clamp_max(1.0)[:, None]
+        least = (tau / last - 1).clamp_max(1.0)[:, None]
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
     def contact_scale(self, terms: LossTerms, noise_level: Tensor, gain: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ VOLUME, FORCES, FLUID, CAMERA, WANTED = 0, 1, 2, 3, 7
 """Loads: of the volume, the forces, the fluid, the camera's four motions, and in `spread` of four wanted numbers."""
 LOADS = WANTED + 4
 NOTHING = 1e-18
-"""Of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-4."""
+"""Of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-5."""
 
 
 class Constants(NamedTuple):
@@ -70,13 +70,10 @@ class Numbers(NamedTuple):
     scale_share: float
     far_share: float
     noise_share: float
-    decrease: float
-    least_scale: float
     camera_motion: float
     damping: float
     settling_damping: float
     settled_step_tol: float
-    longest_step: float
     largest_stretch: float
     contact_noise: float
     evidence: float
@@ -169,7 +166,7 @@ def scaled(c, work, noise_level, tau):
         share = (push2[i] / top) ** POWER
         shares[i] = 0.0 if share < NOTHING else share
     sum_rows(around, c.wider, c.wider_within, shares)
-    least = min(k.decrease * (tau / k.last_tau - 1) + k.least_scale, 1.0) ** 2
+    least = min(tau / k.last_tau - 1, 1.0) ** 2
     for i in range(N):
         expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
         expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)

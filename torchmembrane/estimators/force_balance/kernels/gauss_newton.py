@@ -208,17 +208,15 @@ def border_unknowns(products, vWv, compliance, of_fluid, of_volume):
 
 @compiled
 def _share(c, u, move):
-    """Apply `GaussNewton._share`: return the share of the step that limits the motion of every vertex and the stretch of every
-    grid edge."""
+    """Apply `GaussNewton._share`: return the share of the step that limits the stretch of every grid edge."""
     (m, n), rest, k, tiny = c.surface.free.shape, c.surface.rest, c.numbers, 1e-30
-    far2, stretch2 = 0.0, 0.0
+    stretch2 = 0.0
     here = np.zeros(3)
     for i in range(m):
         for j in range(n):
             inside = 0 < i < m - 1 and 0 < j < n - 1
             for a in range(3):
                 here[a] = move[i - 1, j - 1, a] if inside else 0.0
-            far2 = max(far2, here[0] ** 2 + here[1] ** 2 + here[2] ** 2)
             for axis in range(2):
                 p, q = i + 1 - axis, j + axis
                 if p < m and q < n:
@@ -230,5 +228,4 @@ def _share(c, u, move):
                         change2 += change * change
                         edge2 += edge * edge
                     stretch2 = max(stretch2, change2 / max(edge2, tiny))
-    far2 = max(far2 / (k.longest_step * k.size) ** 2, stretch2 / k.largest_stretch**2, 1.0)
-    return 1 / np.sqrt(far2)
+    return 1 / np.sqrt(max(stretch2 / k.largest_stretch**2, 1.0))
