@@ -10,6 +10,7 @@ from test_force_balance import pressed as pressed
 
 from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.force_balance import traction_loss
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
 from torchmembrane.estimators.force_balance.traction_loss import is_significant
 from torchmembrane.markers.noise import pixel_noise
@@ -46,11 +47,12 @@ def normal_weights(estimator, force):
 
 
 @pytest.mark.parametrize("shear", [0.0, 0.4])
-def test_a_touch_looks_the_same_whatever_its_scale(shear):
+def test_a_touch_looks_the_same_whatever_its_scale(shear, monkeypatch):
     """The loss is that of tractions over what is around: a hundredth of the tractions weighs ten thousand times as much."""
     estimator = make(17)
     loss = estimator.equations.loss
     loss.push_noise = 0 * loss.push_noise
+    monkeypatch.setattr(traction_loss, "LEAST_SCALE", 1e-6)
     _, normal = at_rest(estimator)
     force, _ = push(estimator, (3.0, 0.0, 11.5), 0.5, shear=shear)
     strong, light = (loss.weights(normal.mT, share * force, ONE, SETTINGS.tau[1] * ONE) for share in (1.0, 0.01))
@@ -64,8 +66,8 @@ def test_a_touch_is_seen_beside_one_that_pushes_four_times_as_much_and_a_hundred
     forces, patches = zip(*(push(estimator, *touch) for touch in ((near, 2.0), (far, 0.5), (least, 0.02))), strict=True)
     weight = normal_weights(estimator, sum(forces))
     strong, weak, none = (weight[patch].median() for patch in patches)
-    elsewhere = weight[~sum(patches).bool()].quantile(0.9)
-    assert strong < 0.01 and weak < 0.05 * none and none > 0.9 * elsewhere
+    without = normal_weights(estimator, sum(forces[:2]))[patches[2]].median()
+    assert strong < 0.01 and weak < 0.05 * none and none > 0.9 * without
 
 
 def test_nothing_is_a_push_that_the_noise_makes_by_itself():
@@ -215,7 +217,7 @@ def test_several_rest_images_have_less_noise_than_one(fingertip, rest_images):
 def test_a_marker_that_is_known_badly_moves_nothing(fingertip):
     _, reconstructor = fingertip
     displacement = torch.zeros(1, len(reconstructor.rest_pixels), 2)
-    displacement[0, 40, 0] = 1.0
+    displacement[0, 40, 0] = 0.2
     covariance = 2 * reconstructor.observer.rest_covariance[None].clone()
     moved = []
     for variance in (0.0, 100.0):

@@ -164,16 +164,16 @@ def test_a_schedule_is_that_of_tensor_operations(steps, tol, settle):
 
 def test_the_likeliest_of_the_last_states_is_that_of_tensor_operations():
     """Of hardly damped steps that never settle: the lowest objective is that of the last one in the first frame alone."""
-    balance, last = estimator(prestretch=1.02), []
+    balance, last = estimator(prestretch=1.03), []
     set_settings(balance, settled_step_tol=0.0, settling_damping=1e-6)
     state, measured = problem(balance)
     state = State(0.1 * state.u, *state[1:])
     step = balance.gauss_newton.step
     with torch.no_grad(), using(False), pytest.MonkeyPatch.context() as patch:
         patch.setattr(balance.gauss_newton, "_compiled_step", lambda *given: last.append(step(*given)) or last[-1])
-        after, before = balance.gauss_newton(state, measured, 4.0, 16)
+        after, before = balance.gauss_newton(state, measured, 4.0, 20)
     assert [torch.equal(after.u[k], last[-1].u[k]) for k in range(3)] == [True, False, False]
-    assert_same(taken(balance, state, measured, 4.0, 16), [*after, before], rtol=1e-6)
+    assert_same(taken(balance, state, measured, 4.0, 20), [*after, before], rtol=1e-6)
 
 
 def test_every_setting_is_heard_of():

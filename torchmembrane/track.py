@@ -35,9 +35,9 @@ class Tracker:
     Frames without contact show whether the markers still rest where the rest image has them. If they do not, by more than
     chance, because of temperature, creep, swelling, another pressure or a moved camera, the tracker warns once and recommends
     `rezero`. A slow drift may itself be mistaken for a contact. Therefore frames whose markers hardly deviate from their
-    positions in earlier frames without contact count as well. A drift from before the stream may also look like a contact: a
-    light contact that exists from the first frame, displaces the markers as a drift does and does not move for `STEADY` frames
-    is reported as a possible drift.
+    mean positions in earlier frames without contact, or from those in the latest such frame, count as well. A drift from before
+    the stream may also look like a contact: a light contact that exists from the first frame, displaces the markers as a drift
+    does and does not move for `STEADY` frames is reported as a possible drift.
 
     Args:
         reconstructor: the `Reconstructor` of the sensor.

@@ -60,8 +60,8 @@ class GaussNewton(nn.Module):
     def forward(self, state: State, measured: MeasuredRays, tau: float, steps: int) -> tuple[State, Tensor]:
         """Return the state in which each frame has settled, and the displacement before the last step.
 
-        A frame has settled when the `scaled_step` at the last `tau` is at most `settled_step_tol`. Frames that have not settled when
-        `SETTLING_STEPS` steps are left take these with more damping, and the state with the lowest objective is kept.
+        A frame has settled when the `scaled_step` at the last `tau` is at most `settled_step_tol`. Frames that have not settled
+        when `SETTLING_STEPS` steps are left take these with more damping, and the state with the lowest objective is kept.
 
         Args:
             state: initial state.

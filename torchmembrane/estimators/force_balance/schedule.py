@@ -2,8 +2,9 @@
 
 The loss of compressive traction is quadratic up to the scale `tau`, and saturates beyond it. If `tau` falls slowly, the steps
 stay in the basin of the one minimum that the smooth problem has (graduated non-convexity, GNC). How slowly it must fall differs
-from frame to frame: while a step still moves the surface far, `tau` falls by a seventh; the less the surface moves, the faster
-`tau` falls. The scale of the markers' loss, the damping of a step and the prior of the camera's motion follow `tau`.
+from frame to frame: while a step still moves the surface far, `tau` falls by a seventh; the less the surface moves, compared
+with its displacement from rest, the faster `tau` falls. The scale of the markers' loss, the damping of a step and the prior of
+the camera's motion follow `tau`.
 """
 
 from typing import TypeVar
@@ -19,9 +20,10 @@ STILL = 0.002
 OUTLIER_DECAY_POWER = 1.3
 """The scale of the markers' loss is proportional to this power of `tau`: it starts at twenty times its last value."""
 FIRM = 0.008
-"""Rms displacement from rest, relative to the surface's size, of a press that is firm."""
+"""Rms displacement from rest, relative to the surface's size, above which the steps of a press are compared with the size
+alone."""
 LIGHT = 4e-4
-"""The same of a touch that is as faint as the markers' noise."""
+"""The same, below which the steps are compared with this displacement: markers' noise displaces a surface by about as much."""
 LEAST_MOVE = 1e-9
 """Relative displacement below which a surface stands still; keeps quotients finite."""
 SETTLING_STEPS = 8
@@ -32,7 +34,7 @@ def scaled_step(moved: Scalar, displacement: Scalar) -> Scalar:
     """Return how far a step moves the surface, on the scale by which `tau` falls and a frame settles, `[...]`.
 
     For a firm press it is the rms displacement in the step, relative to the surface's size. A light touch displaces the whole
-    surface by little, so that all its steps are short on that scale; its steps count in proportion to the displacement from rest.
+    surface by little, so that all its steps are short on that scale; they are compared with the displacement from rest instead.
 
     Args:
         moved: rms displacement in the step, relative to the size, `[...]`.

@@ -34,6 +34,7 @@ from .settings import ForceBalanceSettings
 POWER = 4  # exponent of the power mean of squared pushes, which approximates their maximum
 NO_CONTACT_SCALE = 1e6  # relative to p0; far above any push
 NEGLIGIBLE = 1e-6  # weight of a distant vertex relative to that of the centre, below which it is zero
+LEAST_SCALE = 0.02  # relative to p0; single precision rounds the tractions of a slack sheet by up to a fifth of this
 TINY = 1e-12  # keeps roots and quotients of zeros finite
 
 
@@ -120,7 +121,7 @@ class TractionLoss(nn.Module):
         around = top * (((compression2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
         noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
         expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
-        least = (tau / last - 1).clamp_max(1.0)[:, None]
+        least = (tau / last - 1).clamp(LEAST_SCALE, 1.0)[:, None]
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
     def contact_scale(self, terms: LossTerms, noise_level: Tensor, gain: Tensor) -> Tensor:

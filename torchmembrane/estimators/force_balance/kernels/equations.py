@@ -16,7 +16,7 @@ from ....solve.native_band import LANES, RANK, ROWS, storage
 from ....solve.native_rows import sum_rows
 from ....solve.stencil_layouts import OFFSETS
 from ..robust import geman_mcclure_curvature, geman_mcclure_weight
-from ..traction_loss import POWER, TINY
+from ..traction_loss import LEAST_SCALE, POWER, TINY
 
 curvature_of_push, weight_of_push = compiled(geman_mcclure_curvature), compiled(geman_mcclure_weight)
 BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -1 for b in STENCIL) for a in STENCIL)
@@ -166,7 +166,7 @@ def scaled(c, work, noise_level, tau):
         share = (push2[i] / top) ** POWER
         shares[i] = 0.0 if share < NOTHING else share
     sum_rows(around, c.wider, c.wider_within, shares)
-    least = min(tau / k.last_tau - 1, 1.0) ** 2
+    least = min(max(tau / k.last_tau - 1, LEAST_SCALE), 1.0) ** 2
     for i in range(N):
         expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
         expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
