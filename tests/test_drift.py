@@ -143,6 +143,20 @@ def test_a_frame_is_near_where_its_markers_hardly_leave_the_mean():
     assert [watched.is_near((0.3 + step) * field, sure) for step in (0.8 * NEAR_REST, 1.2 * NEAR_REST)] == [True, False]
 
 
+def test_a_frame_is_near_where_the_latest_free_one_was_and_one_with_a_contact_leaves_that_place():
+    watched, pixels, _, _ = watch()
+    field, sure = fields(pixels)["sag"], torch.ones(D)
+    run(watched, 0.0 * field)
+    assert not watched.is_near(0.3 * field, sure)
+    watched.add(0.3 * field, sure)
+    near = [0.3 - 0.8 * NEAR_REST, 0.3 + 0.8 * NEAR_REST, 0.3 + 1.2 * NEAR_REST, 0.3 - 1.2 * NEAR_REST]
+    for _ in range(2):
+        assert [watched.is_near(size * field, sure) for size in near] == [True, True, False, False]
+        watched.add(near[1] * field, sure, is_free=False)
+    watched.forget()
+    assert watched.free is None
+
+
 class Stream:
     """A sensor, what its camera sees of it as it ages, and a press."""
 

@@ -175,7 +175,7 @@ def test_frames_that_take_different_numbers_of_steps_keep_their_readings(strokes
 
 def test_gradients_in_the_reading_agree_with_finite_differences(strokes):
     exact, rise = strokes["liquid"]
-    reconstructor = reconstructor_of(noise=0.01, steps=(64, 32, 200), settled_step_tol=1e-11)
+    reconstructor = reconstructor_of(noise=0.01, steps=(64, 400, 16), settled_step_tol=1e-11)
 
     def answers(reading):
         result = reconstructor.from_pixels(exact[2], pressure=reading)
@@ -193,8 +193,8 @@ def test_gradients_in_the_reading_agree_with_finite_differences(strokes):
 def test_the_noise_of_the_gauge_is_in_the_standard_deviations(strokes):
     """Markers that are sure: what is left is how the answer follows the reading, times the reading's noise."""
     exact, rise = strokes["liquid"]
-    noise = 0.003
-    reconstructor = reconstructor_of(noise=noise, steps=(64, 40, 30))
+    noise = 0.001
+    reconstructor = reconstructor_of(noise=noise, steps=(64, 400, 16), settled_step_tol=1e-9)
     reading = reconstructor.rest_pressure + rise
     sigma = noise * reconstructor.estimator.reference
     with torch.no_grad():
@@ -280,7 +280,7 @@ def reconstruct(path, out, *options):
 
 def test_the_command_takes_readings_of_frames(recording, tmp_path, capsys):
     path, rises = recording
-    reader = tm.Reconstructor.from_file(path / "sensor.toml", settings=tm.ForceBalanceSettings(pressure_noise=0.002))
+    reader = tm.Reconstructor.from_file(path / "sensor.toml", settings=tm.ForceBalanceSettings(pressure_noise=0.001))
     rest = float(reader.rest_pressure)
     tables = {
         "change": f"name,pressure_change\np1.png,{1.2 * rises[1]:.6f}\n",
@@ -291,7 +291,7 @@ def test_the_command_takes_readings_of_frames(recording, tmp_path, capsys):
         told = reader(reader.read(path / "p1.png"), pressure=rest + 1.2e-4 * rises[1])
     for name, text in tables.items():
         (tmp_path / f"{name}.csv").write_text(text)
-        options = ["--pressure", str(tmp_path / f"{name}.csv"), "--pressure-noise", "0.002"]
+        options = ["--pressure", str(tmp_path / f"{name}.csv"), "--pressure-noise", "0.001"]
         assert reconstruct(path, tmp_path / name, *options) == 0
         results = tm.read_results(tmp_path / name)
         assert results["p0"]["force"] == pytest.approx(plain.force[0].numpy(), rel=1e-4, abs=1e-5)
@@ -301,8 +301,8 @@ def test_the_command_takes_readings_of_frames(recording, tmp_path, capsys):
     assert "across.csv" in (said := capsys.readouterr().err) and f"--pressure {tmp_path / 'change.csv'}" in said
     assert reconstruct(path, tmp_path / "change") == 2 and "not measured" in capsys.readouterr().err
     options[1], options[3] = str(tmp_path / "change.csv"), "0.01"
-    assert reconstruct(path, tmp_path / "change", *options) == 2 and "--pressure-noise 0.002" in capsys.readouterr().err
-    options[3] = "0.002"
+    assert reconstruct(path, tmp_path / "change", *options) == 2 and "--pressure-noise 0.001" in capsys.readouterr().err
+    options[3] = "0.001"
     assert reconstruct(path, tmp_path / "change", *options) == 0
 
 

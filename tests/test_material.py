@@ -38,10 +38,10 @@ def sensor(material):
 
 @pytest.fixture(scope="module")
 def presses():
-    """Pixels of the dots under a ball pressed in two directions, on 31 x 31 vertices, with noise, and its forces."""
+    """Pixels of the dots under a ball pressed in three directions, on 31 x 31 vertices, with noise, and its forces."""
     dome, dots = CAP.membrane((31, 31)), sensor(Material("neo_hookean", 1.5)).markers.positions
     elasticity, pixels, forces = ElasticEnergy(dome, "neo_hookean", PRESTRETCH, MODULUS), [], []
-    for direction in ((0.5, 0.0, -0.866), (-0.3, 0.3, -0.906)):
+    for direction in ((0.5, 0.0, -0.866), (-0.3, 0.3, -0.906), (0.0, -0.5, -0.866)):
         direction = torch.tensor(direction, dtype=torch.float64)
         ball = Sphere(4.0).touching(dome, direction)
         state = press(dome, elasticity, [[ball, ball.moved(2.5 * direction)]])
@@ -81,7 +81,7 @@ def test_modulus_is_proportional_to_the_forces_and_needs_but_one_of_them(presses
     pixels, forces = presses
     reconstructor = Reconstructor(sensor(Material("neo_hookean", 1.5)), dtype=torch.float64)
     seen = Presses(reconstructor, pixels - reconstructor.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))
-    lengths = np.linalg.norm(forces, axis=1, keepdims=True) * [[1.0], [np.nan]]
+    lengths = np.linalg.norm(forces, axis=1, keepdims=True) * [[1.0], [np.nan], [np.nan]]
     one, twice = (np.array(seen.modulus(0.2, 0.05, KnownForces(k * lengths))[:3]) for k in (1, 2))
     assert np.allclose(twice, 2 * one) and one[0] > 0 > one[2]
 

@@ -56,7 +56,7 @@ def test_the_example_s_tracker_follows_the_last_frame(example):
 
 
 def test_the_example_reads_back_what_was_found(example):
-    """To the last bit what is found of these images; with gradients, by tensor operations, but for rounding."""
+    """To the last bit what is found of these images; with gradients, by tensor operations, within half a settled step."""
     results, reconstructor = example["results"], example["reconstructor"]
     found = reconstructor(example["images"].detach())
     assert sorted(results.names) == sorted(PRESSES)
@@ -64,7 +64,8 @@ def test_the_example_reads_back_what_was_found(example):
         for key, value in found.frame(row).items():
             np.testing.assert_array_equal(results[name][key], value, err_msg=key)
         recorded = example["result"].frame(row)
-        np.testing.assert_allclose(recorded["vertices"], results[name]["vertices"], rtol=0, atol=1e-3)
+        apart = np.square(recorded["vertices"] - results[name]["vertices"]).sum(-1).mean() ** 0.5
+        assert apart < 0.5 * torchmembrane.ForceBalanceSettings().settled_step_tol * reconstructor.estimator.size
         np.testing.assert_allclose(recorded["force"], results[name]["force"], rtol=0, atol=1e-3 * abs(recorded["force"]).max())
 
 
