@@ -369,6 +369,15 @@ def test_a_slow_drift_is_said_even_where_it_is_taken_for_a_contact(stream, touch
     assert 20 < frame < 40 and "without contact" in words
 
 
+def test_a_frame_with_a_contact_is_no_free_one_however_near_it_is(stream, at_rest, touched_from):
+    touched_from(15)
+    tracker = tm.Tracker(stream.reconstructor)
+    assert said(tracker, at_rest[:15]) == []
+    free = tracker._watch.free
+    assert said(tracker, at_rest[15:18]) == []
+    assert tracker._watch.frames == 18 and torch.equal(tracker._watch.free, free)
+
+
 def test_what_comes_at_once_may_well_be_a_contact(stream, at_rest, touched_from):
     touched_from(20)
     (aged,) = stream.images([stream.aged(0.1)], seed=8)

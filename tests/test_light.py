@@ -59,6 +59,16 @@ def test_a_touch_looks_the_same_whatever_its_scale(shear, monkeypatch):
     torch.testing.assert_close(light, 1e4 * strong)
 
 
+def test_tractions_are_compared_with_p0_while_tau_is_large_and_with_no_less_than_the_least_scale():
+    loss, last = make(17).equations.loss, SETTINGS.tau[1]
+    loss.push_noise = 0 * loss.push_noise
+    none = torch.zeros(5, len(loss.area), dtype=torch.float64)
+    tau = last * torch.tensor([10.0, 2.0, 1.5, 1.1, 1.0], dtype=torch.float64)
+    rho = loss.scale2(none, torch.ones_like(tau), tau).sqrt()
+    law = torch.tensor([1.0, 1.0, 0.5, 0.1, traction_loss.LEAST_SCALE], dtype=torch.float64)
+    torch.testing.assert_close(rho, law[:, None].expand_as(rho))
+
+
 def test_a_touch_is_seen_beside_one_that_pushes_four_times_as_much_and_a_hundredth_is_not():
     estimator = make(33)
     estimator.equations.loss.push_noise *= 0
