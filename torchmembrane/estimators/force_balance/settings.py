@@ -93,7 +93,7 @@ class ForceBalanceSettings:
     scale_share: float = 0.2
     far_share: float = 0.05
     noise_share: float = 0.6
-    contact_noise: float = 3.5
+    contact_noise: float = 3.2
     evidence: float = 0.35
     friction: float = 3.75
     slip: float = 0.05
