@@ -190,10 +190,13 @@ def test_gradients_in_the_reading_agree_with_finite_differences(strokes):
     assert gradients[0] > 0.05
 
 
-def test_the_noise_of_the_gauge_is_in_the_standard_deviations(strokes):
-    """Markers that are sure: what is left is how the answer follows the reading, times the reading's noise."""
-    exact, rise = strokes["liquid"]
-    noise = 0.001
+@pytest.mark.parametrize("noise, shallowest", [(0.001, 0), (0.003, 1)])
+def test_the_noise_of_the_gauge_is_in_the_standard_deviations(strokes, noise, shallowest):
+    """Markers that are sure: what is left is how the answer follows the reading, times the reading's noise.
+
+    A larger noise changes what the shallowest of the three presses pushes, which is beyond the first order.
+    """
+    exact, rise = (values[shallowest:] for values in strokes["liquid"])
     reconstructor = reconstructor_of(noise=noise, steps=(64, 400, 16), settled_step_tol=1e-9)
     reading = reconstructor.rest_pressure + rise
     sigma = noise * reconstructor.estimator.reference

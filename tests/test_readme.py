@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import torchmembrane
 from torchmembrane.cli.main import main
@@ -67,6 +68,15 @@ def test_the_example_reads_back_what_was_found(example):
         apart = np.square(recorded["vertices"] - results[name]["vertices"]).sum(-1).mean() ** 0.5
         assert apart < 0.5 * torchmembrane.ForceBalanceSettings().settled_step_tol * reconstructor.estimator.size
         np.testing.assert_allclose(recorded["force"], results[name]["force"], rtol=0, atol=1e-3 * abs(recorded["force"]).max())
+
+
+def test_with_gradients_the_example_s_images_give_the_same_but_for_rounding():
+    """In double precision; in single precision rounding decides with which step a frame has settled."""
+    reconstructor = torchmembrane.Reconstructor.from_file(ROOT / "examples" / "sensor.toml", dtype=torch.float64)
+    images = reconstructor.read(*(ROOT / "examples" / f"{name}.png" for name in PRESSES))
+    found, recorded = (reconstructor(each).cpu() for each in (images, images.clone().requires_grad_()))
+    np.testing.assert_allclose(recorded.vertices.detach(), found.vertices.detach(), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(recorded.force.detach(), found.force.detach(), rtol=0, atol=1e-6 * float(abs(found.force).max()))
 
 
 def test_every_linked_file_exists():

@@ -115,6 +115,7 @@ class TractionLoss(nn.Module):
         """Return `rho^2 [B, N]` from `S^2 [B, N]` and the frames' noise relative to that at rest, `[B]`.
 
         A lower bound depends on the scale `tau [B]` of the step, so that `rho` starts at 1 from rest, where nothing pushes yet.
+        At the last `tau` it is `LEAST_SCALE`.
         """
         settings, last = self.settings, self.settings.tau[-1]
         top = compression2.amax(-1, keepdim=True).clamp_min(TINY)
