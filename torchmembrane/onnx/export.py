@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from .. import __version__
 from ..control_flow import FUNCTIONS, Value, where_rows
 from ..errors import MembraneError, check_arguments
+from ..estimators.base import Estimator
 from ..files.atomic import write_bytes
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
@@ -34,7 +35,7 @@ from .trace import EXPORTER, traced_model
 
 FORMAT = 1
 SEAL = "SHA-256: "
-CHECK, NODES = 0.65, 11_500  # for the default estimator: share of the time before the check, and number of traced nodes
+CHECK, NODES = 0.85, 6_000  # for the default estimator: share of the time before the check, and traced nodes for each grid
 IMAGE, PREVIOUS = "image", "previous_pixels"
 EXAMPLES = 2  # frames of the example inputs; the batch size of the model stays free
 
@@ -70,8 +71,8 @@ class Tracer:
     Nodes are named after the subpackage from which they come.
     """
 
-    def __init__(self, progress: Progress = silent) -> None:
-        self.assembly, self.progress = Assembly(), progress
+    def __init__(self, progress: Progress = silent, expected: int = NODES) -> None:
+        self.assembly, self.progress, self.expected = Assembly(), progress, expected
         self.traced: dict[tuple[Any, ...], onnx.ModelProto] = {}
         self.nodes = 0  # number of nodes traced so far
 
@@ -135,7 +136,7 @@ class Tracer:
             self.assembly.part = type(owner).__module__.removeprefix("torchmembrane.").partition(".")[0]
         key = (owner, function, str(structure), *fixed.items(), *(value.shape for value in examples.values()))
         if key not in self.traced:
-            self.progress(min(1.0, self.nodes / NODES), getattr(function, "__qualname__", ""))
+            self.progress(min(1.0, self.nodes / self.expected), getattr(function, "__qualname__", ""))
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
                 self.traced[key] = self._whole(traced_model(Piece(owner, function, arranged), examples, outputs))
@@ -231,7 +232,8 @@ def export(
     if reconstructor.rest_pixels.dtype != torch.float32:
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
     progress(0.0, "image")
-    tracer, generator = Tracer(within(progress, 0.0, CHECK)), torch.Generator().manual_seed(0)
+    grids = max(1, sum(isinstance(part, Estimator) for part in reconstructor.estimator.modules()))
+    tracer, generator = Tracer(within(progress, 0.0, CHECK), NODES * grids), torch.Generator().manual_seed(0)
     images = [
         tracer.given(name, torch.rand(EXAMPLES, 1, height, width, generator=generator).to(reconstructor.rest_pixels))
         for name, (width, height) in image_inputs(reconstructor).items()
