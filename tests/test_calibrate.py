@@ -384,6 +384,7 @@ def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image
     gap = truth.surface.membrane((129, 129)).closest_points(vertices).distance
     assert (gap < 3 * found.surface.deviations)[radius < 8].mean() > 0.97
     assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.projection.signed_distance).mean()
+    assert np.median(found.deviations) == pytest.approx(0.1 / 12, rel=0.3)  # of means of 12 x 12 depths
     assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
 
 

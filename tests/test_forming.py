@@ -19,7 +19,7 @@ from torchmembrane.forming.outline import ellipse, outline_of, rectangle
 from torchmembrane.forming.sheet_energy import SheetEnergy
 from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.presets.blown_up import Stated, blown_up
+from torchmembrane.presets.blown_up import Stated, _distance, blown_up
 from torchmembrane.sensor.factories import elastic_energy
 from torchmembrane.sensor.inflated import InflatedSurface
 from torchmembrane.surface.membrane import Membrane
@@ -325,3 +325,13 @@ def test_a_rest_surface_is_the_same_without_gradients(mode):
         found = film(rim, 9).vertices
     outline_grid_module._outline_grid.cache_clear()
     np.testing.assert_array_equal(found, film(rim, 9).vertices)
+
+
+def test_a_dot_keeps_clear_of_the_sides_of_a_rim_not_of_the_lines_through_them():
+    """An L: in its corner the lines through the notch's sides run across the membrane."""
+    rim = np.array([[0.0, 0], [6, 0], [6, 2], [2, 2], [2, 6], [0, 6]])
+    share = np.linspace(0, 1, 4001)[:, None]
+    sides = np.concatenate([a + share * (b - a) for a, b in zip(rim, np.roll(rim, -1, 0), strict=True)])
+    points = np.random.default_rng(0).uniform(0, 6, (200, 2))
+    expected = np.linalg.norm(points[:, None] - sides, axis=-1).min(1)
+    np.testing.assert_allclose(_distance(rim, points), expected, atol=2e-3)

@@ -12,6 +12,7 @@ import torch
 from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.calibrate.rim import find_rim
 from torchmembrane.cli.main import main
+from torchmembrane.presets.annotate import annotate
 from torchmembrane.presets.dot_list import read_drafted_dots
 from torchmembrane.presets.draft import (
     RimCircle,
@@ -80,6 +81,16 @@ def test_the_overpressure_is_that_of_a_neo_hookean_sphere(unit):
     p = 2 * mu * flat / before * (1 / stretch - 1 / stretch**7) * METRE[unit] ** 2 / 100
     blown_up = Material("neo_hookean", stretch, None, mu, flat / stretch**2)
     assert overpressure(membrane, blown_up, unit) == pytest.approx(p, rel=5e-3)
+
+
+@pytest.mark.parametrize("unit", METRE)
+def test_what_is_proposed_in_comments_is_the_same_in_every_unit(unit, tmp_path):
+    path, one = tmp_path / "sensor.toml", METRE[unit] / 1000
+    path.write_text("[material]\nprestretch = 1.2\n")
+    annotate(path, [], True, unit)
+    proposed = {key: float(value) for key, value in re.findall(r"^# (\w+) = ([-+.e\d]+)", path.read_text(), re.MULTILINE)}
+    lengths = {"distance": 2.0 * one, "shear_modulus": 0.3 / one**2}  # 0.3 N/mm^2
+    assert {key: proposed[key] for key in lengths} == pytest.approx(lengths, rel=1e-5) and proposed["index"] == 1.33
 
 
 def test_of_overpressure_prestretch_and_modulus_any_two_give_the_third():

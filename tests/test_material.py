@@ -119,6 +119,12 @@ def test_the_figure_marks_one_deviation_on_either_side_of_the_prestretch():
     assert span.get_extents().transformed(figure.axes[0].transData.inverted()).intervalx == pytest.approx([1.3, 1.5])
 
 
+def test_a_report_says_how_far_points_are_off_on_either_side():
+    none, off = np.zeros(0), np.array([[0.3, 0.0], [0.0, -0.5]])
+    report = Report("lens", [], [], none, none, none, np.zeros((0, 0)), off, off, 0.1, [])
+    assert report.lines == ["lens", "  residuals: 2 points, 0.292 px rms, at most 0.500 px"]
+
+
 def test_rest_tells_no_prestretch():
     plain = sensor(Material("neo_hookean", 1.5))
     pixels = CAMERA.point_to_pixel(torch.from_numpy(plain.markers.positions))[None]

@@ -1,5 +1,7 @@
 """Simulated presses obey closed forms, force balance and friction."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -291,3 +293,19 @@ def test_wrong_arguments_are_refused(dome):
     ):
         with pytest.raises(MembraneError, match=message):
             press(dome, elasticity, paths, **options)
+
+
+def test_a_body_that_turns_goes_by_increments_of_what_its_farthest_points_travel(dome, monkeypatch):
+    """A ball turned by half a radian on the spot, with steps of a tenth of the surface's size."""
+    solve, turns = EquilibriumProblem.solve, []
+
+    def watched(problem, x, pressure, contacts=()):
+        turns.append(contacts[0].indenter.rotation)
+        return solve(problem, x, pressure, contacts)
+
+    monkeypatch.setattr(EquilibriumProblem, "solve", watched)
+    ball, c, s = tip(dome).moved((0, 0, -0.3)), np.cos(0.5), np.sin(0.5)
+    turned = ball.at(ball.translation, torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
+    press(dome, elasticity_of(dome), [[ball, turned]], increment=0.1 * dome.size)
+    steps = [float(((before.T @ after).trace() - 1).div(2).clamp(-1, 1).acos()) for before, after in pairwise(turns)]
+    assert max(steps) < 0.1 + 1e-6 and sum(steps) == pytest.approx(0.5, abs=1e-6)

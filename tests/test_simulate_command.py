@@ -249,6 +249,7 @@ def test_a_folder_of_another_look_or_sensor_is_refused(sensor_path, tmp_path, ca
         (("--indenter", "sphere", "--radius", "1e300", "--depth", "1"), "--radius 1e+300: no press"),
         (("--indenter", "sphere", "--radius", "3", "--depth", "1e300"), "--depth 1e+300: no press"),
         ((*SPHERE, "--increment", "1e-9"), "--increment 1e-09: no press"),
+        (("--indenter", "box", "--sides", "4,4,1e6", "--radius", "0.5", "--depth", "1"), "--sides 4,4,1e+06: no press"),
         ((*SPHERE, "--dots", "5,9"), "--dots, radii of small and large dots: dots 0 and"),
         ((*SPHERE, "--name", "sensor_rest"), "--name sensor_rest"),
         (("--indenter", "/etc/passwd", "--depth", "1"), "/etc/passwd: its name is not that of a mesh; expected a closed mesh"),

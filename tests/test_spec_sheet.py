@@ -4,6 +4,7 @@ import math
 import pickle
 from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from PIL import Image
 from torchmembrane.accuracy import measure, presses, rig, statistics
 from torchmembrane.accuracy.finished import FinishedSeries
 from torchmembrane.accuracy.measure import spec_sheet
-from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, Effort, PairTrial, PressTrial, Spread
+from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, Effort, Outcome, PairTrial, PressTrial, Spread
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.cli.sheet import sheet_lines
@@ -342,6 +343,17 @@ def test_another_seed_gives_another_sheet(sensor, sheet):
     """That the same seed gives the same one, the sheet says that is interrupted."""
     other = spec_sheet(sensor, 4, effort=LITTLE._replace(strokes=1, directions=0))
     assert other.rest != sheet.rest and not {t.force for t in other.presses} & {t.force for t in sheet.presses}
+
+
+@pytest.mark.parametrize("count, share", [(25, 0.2), (100, 0.1), (2500, 0.05)])
+def test_a_contact_counts_as_found_within_the_markers_spacing_and_within_a_twentieth_of_the_size(
+    sensor, monkeypatch, count, share
+):
+    markers, simulator = SimpleNamespace(rest_markers=np.zeros((count, 3))), SimpleNamespace(grid=(22, 22))
+    monkeypatch.setattr(measure, "Rig", lambda *_: SimpleNamespace(simulator=simulator, reconstructor=markers))
+    monkeypatch.setattr(measure, "_outcomes", lambda *_: [Outcome()])
+    sheet, size = spec_sheet(sensor, noise=40.0, effort=Effort(0, 0, 0, 0, 0)), sensor.membrane.size
+    assert sheet.near == pytest.approx(share * size) and sheet.spacing == pytest.approx(size / count**0.5)
 
 
 def test_a_sheet_is_what_its_trials_give(sheet, sensor):

@@ -9,7 +9,7 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.calibrate.material import material_from_pixels
-from torchmembrane.camera.rig import Rig
+from torchmembrane.camera.rig import Rig, turns_by_noise
 from torchmembrane.cli.describe import described, rest_frame
 from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
@@ -166,6 +166,28 @@ def test_rays_of_a_rig_pass_through_the_points_whose_pixels_they_are():
     miss = torch.linalg.cross(points - origin, direction)
     torch.testing.assert_close(miss, torch.zeros_like(miss), rtol=0, atol=1e-9)
     torch.testing.assert_close(direction.norm(dim=-1), torch.ones(4, 21).double())
+
+
+def test_one_view_that_has_moved_too_far_is_enough():
+    rig = Rig([CAMERA, CAMERA], [ViewPose(np.eye(3), np.zeros(3)), BESIDE])
+    far = torch.zeros(4, 2, 4)
+    far[1, 0, 0], far[2, 1, 1], far[3, :, 0] = 50.0, -50.0, 50.0
+    assert rig.is_displaced(far.flatten(1)).tolist() == [False, True, True, True]
+
+
+@pytest.mark.parametrize("ports", [(), ((0.5, 4.0, 1.49), (6.0, 1.0, 1.6))])
+def test_rays_turn_by_the_noise_of_pixels_about_points_on_them(ports):
+    """By how far a ray to a neighbouring pixel misses the point, over its distance; behind a port rays shift as well."""
+    camera = tm.Camera("pinhole", (160, 120), (100, 100), (79.5, 59.5), ports=list(ports), medium_index=1.33 if ports else 1.0)
+    points = torch.rand(1, 9, 3, dtype=torch.float64) * torch.tensor([10, 8, 4]) + torch.tensor([-5, -4, 9])
+    pixels, step = camera.point_to_pixel(points), 1e-4
+    turned = turns_by_noise(camera, pixels, points, 0.04 * torch.eye(2).double().expand(9, 2, 2))
+    distance = (points - camera.pixel_to_ray(pixels).origin).norm(dim=-1)[..., None]
+    for k in range(2):
+        origin, direction = camera.pixel_to_ray(pixels + step * torch.eye(2).double()[k])
+        miss = origin - points + ((points - origin) * direction).sum(-1, keepdim=True) * direction
+        across = turned[:, :, k] - (turned[:, :, k] * direction).sum(-1, keepdim=True) * direction
+        torch.testing.assert_close(across, 0.2 / step * miss / distance, rtol=1e-3, atol=1e-6)
 
 
 def test_two_views_see_what_one_infers(found, alone, press):
