@@ -208,6 +208,15 @@ def test_an_ellipse_is_found_whether_lighter_or_darker_outside(outside, markers)
     assert rim.share > 0.95
 
 
+@pytest.mark.parametrize("radius", [80.0, 80.25, 80.5, 80.75])
+def test_a_rim_is_found_between_the_pixels(radius):
+    """Of a blurred edge without noise."""
+    v, u = np.mgrid[:240, :320]
+    image = 0.2 + 0.6 / (1 + np.exp((np.hypot(u - 160.3, v - 118.8) - radius) / 0.8))
+    rim = find_rim(image)
+    assert [*rim.centre, *rim.half_axes] == pytest.approx([160.3, 118.8, radius, radius], abs=0.03)
+
+
 def test_a_rim_that_is_not_in_the_image_is_not_found():
     dots = np.stack(np.meshgrid(np.arange(90, 220, 30), np.arange(75, 185, 25)), -1).reshape(-1, 2)
     v, u = np.mgrid[:240, :320]

@@ -11,6 +11,7 @@ from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate import equilibrium as equilibrium_module
 from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
+from torchmembrane.simulate.frictional_contact import FrictionalContact
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
 from torchmembrane.simulate.quasi_static import carried, press, presses
 from torchmembrane.solve.stencil import ONE_RING, apply_stencil, inner, one_ring_edges
@@ -293,6 +294,16 @@ def test_wrong_arguments_are_refused(dome):
     ):
         with pytest.raises(MembraneError, match=message):
             press(dome, elasticity, paths, **options)
+
+
+def test_a_vertex_is_carried_from_where_the_body_meets_it():
+    """A plate moved by 1.5 down and 0.6 sideways: one vertex it meets at two thirds, one it holds, one it never meets."""
+    plate, travel = Plane(rotation=facing((0, 0, -1.0)), translation=(0, 0, 1.0)), torch.tensor([0.6, 0.0, -1.5]).double()
+    x = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 1.0], [4.0, 0.0, -3.0]], dtype=torch.float64)
+    contact = FrictionalContact.at_first_pose(plate, x, 1.0, 0.3)
+    contact = contact._replace(normal=torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64))
+    carried_by = contact.carried_to(plate.moved(travel), x).anchor - x
+    torch.testing.assert_close(carried_by, torch.tensor([[1 / 3], [1.0], [0.0]]).double() * travel)
 
 
 def test_a_body_that_turns_goes_by_increments_of_what_its_farthest_points_travel(dome, monkeypatch):

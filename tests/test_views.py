@@ -16,10 +16,12 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.jobs.inputs import Inputs, of_first_view
 from torchmembrane.plot.sensor import sensor_figure
 from torchmembrane.pose import ViewPose
+from torchmembrane.results.status import Status
 from torchmembrane.results.store import Mesh, Settings
 from torchmembrane.results.view_status import status_in_words
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.sensor.view_images import first_view_image, first_view_picture
 from torchmembrane.sensor.views import View
 from torchmembrane.simulate import Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
@@ -224,6 +226,39 @@ def test_the_order_of_the_views_does_not_matter(press, found):
     back = BESIDE.points(got.vertices[0])
     assert float((back - found.vertices[0]).norm(dim=-1).max()) < 0.02 * 1.2
     np.testing.assert_allclose(BESIDE.vectors(got.force[0]).numpy(), found.force[0].numpy(), atol=0.03 * found.force.norm())
+
+
+def test_the_first_view_of_a_picture_is_its_region_wherever_that_lies():
+    whole = tm.Camera("pinhole", (400, 300), (200, 200), (199.5, 149.5))
+    views = [View(name, whole.in_mode((left, 130, 160, 120)), is_region=True) for name, left in (("a", 210), ("b", 20))]
+    grey = np.arange(300 * 400).reshape(300, 400) % 251
+    expected = grey[130:250, 210:370]
+    np.testing.assert_array_equal(first_view_picture(grey, views), expected)
+    np.testing.assert_array_equal(first_view_picture(np.stack([grey] * 3, -1), views)[..., 1], expected)
+    np.testing.assert_array_equal(first_view_image(torch.from_numpy(grey)[None, None], views), expected)
+    apart = [View("a", CAMERA), View("b", CAMERA)]
+    assert first_view_picture([grey, None], apart) is grey and first_view_picture([None, grey], apart) is None
+    assert first_view_picture(grey, ()).shape == first_view_image(torch.from_numpy(grey)[None, None], ()).shape == (300, 400)
+
+
+def test_a_camera_given_to_a_region_is_that_of_the_region_s_pixels():
+    whole = tm.Camera("pinhole", (640, 480), (400, 410), (320, 240))
+    view = View("right", whole.in_mode((320, 96, 320, 300)), is_region=True)
+    lens = tm.Camera("pinhole", (320, 300), (405, 402), (3.5, 147.0), (-0.1, 0.02, 0.001, -0.002))
+    found, points = view.with_camera(lens), torch.tensor([[1.0, 2.0, 20.0], [4.0, -3.0, 25.0]], dtype=torch.float64)
+    assert found.region == view.region and found.camera.mode.image_size == (640, 480)
+    torch.testing.assert_close(found.camera.point_to_pixel(points), lens.point_to_pixel(points))
+
+
+def test_where_all_views_fail_the_frame_has_the_gravest_of_their_reasons(reconstructor):
+    """Values that are none before blank images, these before too few markers, and these before another scene."""
+    gravest = [Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UNLIKE_REST]
+    pairs = torch.tensor([[int(one), int(other)] for one in gravest for other in gravest])
+    flow = reconstructor.observer.from_pixels(reconstructor.rest_pixels[None], None, None)
+    many = [value.expand(len(pairs), *value.shape[1:]) for value in flow[:3]]
+    found = reconstructor.observer.judge(*many, pairs)
+    expected = [gravest[min(i, j)] for i in range(4) for j in range(4)]
+    assert found.status.tolist() == expected and (found.confidence == 0).all()
 
 
 def test_a_view_that_fails_is_left_out_and_named(reconstructor, alone, press):
