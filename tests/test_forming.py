@@ -335,3 +335,22 @@ def test_a_dot_keeps_clear_of_the_sides_of_a_rim_not_of_the_lines_through_them()
     points = np.random.default_rng(0).uniform(0, 6, (200, 2))
     expected = np.linalg.norm(points[:, None] - sides, axis=-1).min(1)
     np.testing.assert_allclose(_distance(rim, points), expected, atol=2e-3)
+
+
+def test_an_outline_s_frame_leads_back_to_its_points():
+    """An irregular tilted polygon with more points on one side: its origin is the middle of its area."""
+    rng = np.random.default_rng(0)
+    angle = np.sort(np.concatenate([rng.uniform(0, 2, 12), np.linspace(2, 6, 7)]))
+    flat = np.stack([9 * np.cos(angle), 6 * np.sin(angle), rng.uniform(-0.2, 0.2, 19)], -1)
+    X = flat @ Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix().T + [3.0, -2.0, 40.0]
+    outline = outline_of(X)
+    np.testing.assert_allclose(outline.camera_frame(np.column_stack([outline.points, outline.heights])), X, atol=1e-12)
+    p, q = outline.points, np.roll(outline.points, -1, 0)
+    cross = p[:, :1] * q[:, 1:] - p[:, 1:] * q[:, :1]
+    np.testing.assert_allclose(((p + q) * cross).sum(0), 0, atol=1e-9)
+
+
+def test_samples_of_a_rim_are_at_equal_steps_once_around():
+    samples = outline_of(raised(ellipse((40.0, 40.0)))).sampled(24)
+    steps = np.linalg.norm(np.roll(samples, -1, 0) - samples, axis=1)
+    np.testing.assert_allclose(steps, 40 * np.sin(np.pi / 24), rtol=1e-3)

@@ -128,6 +128,13 @@ def test_dots_are_the_same_in_whatever_frame_they_are_given(tmp_path, shape):
         assert got_sizes == sizes and np.abs(got - X).max() < 0.02, header
 
 
+def test_a_pitch_that_gives_too_many_dots_is_refused_with_their_number():
+    """The area of half a sphere over the pitch's square."""
+    with pytest.raises(MembraneError, match=r"a pitch of 0.05 gives (\d+) dots; expected one that gives 8 to") as refused:
+        drafted_dots(drafted_surface("dome", {"radius": 12.0}, 15.0), 0.05)
+    assert int(re.search(r"gives (\d+) dots", str(refused.value))[1]) == pytest.approx(2 * np.pi * (12 / 0.05) ** 2, rel=0.02)
+
+
 @pytest.mark.parametrize("model", ["pinhole", "fisheye"])
 def test_the_rim_s_circle_gives_the_distance_and_the_focal_length(model):
     camera = Camera(model, (640, 480), (200, 200), (320, 240))

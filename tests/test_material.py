@@ -97,6 +97,21 @@ def test_of_a_measured_force_counts_what_is_along_the_one_that_is_found():
         assert ratios == pytest.approx([ratio]) and magnitudes.ravel() == pytest.approx([2.0, 3.0])
 
 
+def test_forces_that_scatter_leave_the_error_of_their_mean():
+    """Ratios of measured to found forces, each known to a tenth: their own scatter where that is larger, else the tenth."""
+    material, cavity = SimpleNamespace(modulus=0.4), SimpleNamespace(filling="liquid")
+    reconstructor = SimpleNamespace(sensor=SimpleNamespace(material=material), estimator=SimpleNamespace(cavity=cavity))
+    for ratios in (np.array([0.8, 1.6, 1.1, 2.1]), np.array([1.19, 1.21, 1.2, 1.2])):
+        given = SimpleNamespace(
+            reconstructor=reconstructor,
+            _refuse_unpressed=lambda *_: None,
+            _ratios=lambda *_, ratios=ratios: (ratios, np.stack([np.ones(4), ratios], 1)),
+        )
+        modulus, deviation, *_ = Presses.modulus(given, 0.1, 0.02, KnownForces(np.ones((4, 1))))
+        assert modulus == pytest.approx(0.4 * ratios.mean())
+        assert deviation / modulus == pytest.approx(max(0.1, ratios.std(ddof=1) / ratios.mean()) / 4**0.5)
+
+
 @pytest.mark.filterwarnings("ignore:.*acts as a liquid")
 @pytest.mark.usefixtures("calibration_grids")
 def test_a_gas_of_unknown_modulus_is_found_as_one_whose_file_says_it(presses):
