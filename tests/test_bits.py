@@ -235,3 +235,10 @@ def test_init_takes_the_bits_of_its_rest_image(folder, tmp_path, capsys):
     assert main([*command, "--bits", "10"]) == 0
     assert Sensor.from_file(tmp_path / "s.toml").camera.bits == 10
     assert main([*command, "--bits", "9", "--force"]) == 2 and "as bits = 9 in" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count", [1, 3, 16])
+def test_means_of_up_to_sixteen_images_of_few_bits_are_recognised(count):
+    images = np.random.default_rng(0).integers(0, 2**10, (count, 12, 16))
+    assert "as of a camera of 10 bits" in too_few_bits(images.mean(0).astype(np.float32) / 65535)
+    assert too_few_bits(images.mean(0) / 1023 * 0.9) == ""

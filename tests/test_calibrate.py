@@ -25,6 +25,7 @@ from torchmembrane.calibrate.detection import find_target
 from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_errors
 from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
+from torchmembrane.calibrate.surface import correction, surface_projection
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.camera.targets import Checkerboard, DotBoard
@@ -37,6 +38,7 @@ from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.simulator import Simulator
 from torchmembrane.simulate.target_renderer import TargetRenderer
+from torchmembrane.surface.shapes import spherical_cap
 
 SIZE, NOISE = (320, 240), 40.0
 LENSES = {
@@ -384,7 +386,19 @@ def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image
     gap = truth.surface.membrane((129, 129)).closest_points(vertices).distance
     assert (gap < 3 * found.surface.deviations)[radius < 8].mean() > 0.97
     assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.projection.signed_distance).mean()
+    assert np.median(found.deviations) == pytest.approx(0.1 / 12, rel=0.3)  # of means of 12 x 12 depths
     assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
+
+
+def test_a_corrected_surface_is_as_sure_as_the_points_that_move_it():
+    """Its offsets are linear in the points' distances: independent deviations of these add up in quadrature."""
+    flat, rng = spherical_cap(12.0, 0.5, 20.0, (7, 7)), np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-6, 6, (14, 2)), np.full(14, 20.5)])
+    projection, variances = surface_projection(flat, points), rng.uniform(0.5, 2.0, 14) ** 2
+    each = [correction(flat, projection._replace(signed_distance=one), variances) for one in np.eye(14)]
+    slopes = np.stack([found.offsets for found in each], 1)
+    assert (slopes < -0.05).any()  # of what is extrapolated
+    np.testing.assert_allclose(each[0].deviations, np.sqrt(slopes**2 @ variances), rtol=0.03)  # normals are nearly parallel
 
 
 @pytest.mark.parametrize("factor, said", [(0.001, "--unit 1000 times as large"), (10.0, "--unit 0.1 times as large")])

@@ -174,6 +174,23 @@ def test_a_fisheye_may_fold_beyond_its_circle_where_it_shows_all_of_the_membrane
         refuse_folds(camera, torch.tensor([[3.0, 0.0, -5.0]], dtype=torch.float64))
 
 
+@pytest.mark.parametrize("centre", [(320.0, 240.0), (320.0, 300.0), (420.0, 240.0)])
+def test_a_fisheye_s_circle_is_the_largest_about_its_centre_that_fits_into_the_image(centre):
+    """It may fold beyond that, not before: of a centre off the middle the circle ends at the nearer border."""
+    u, v = centre
+    reach = min(u, v, 639 - u, 479 - v)
+    points = torch.tensor([[1.0, 0.0, 5.0]], dtype=torch.float64)
+    for share, fits in ((0.9, False), (1.15, True)):
+        focal = share * reach / (2 / 3 * 5.0**0.5)  # of t - t^3 / 15 the largest value, at t = root of 5
+        camera = Camera("fisheye", (640, 480), (focal, focal), centre, [-1 / 15, 0.0, 0.0, 0.0])
+        assert fold_in_image(camera) == pytest.approx(share * reach, abs=2)
+        if fits:
+            refuse_folds(camera, points)
+        else:
+            with pytest.raises(MembraneError, match="within the image"):
+                refuse_folds(camera, points)
+
+
 def test_a_fold_that_is_cropped_away_is_none():
     camera = Camera("pinhole", (640, 480), (400.0, 400.0), (320.0, 240.0), [-0.3])
     assert fold_in_image(camera) < math.inf

@@ -253,6 +253,24 @@ def test_a_marker_faces_the_camera_by_the_cosine_between_its_normal_and_its_line
     torch.testing.assert_close(facings(point, normal), torch.tensor([0.8, 1.0, -(5**-0.5)]))
 
 
+def test_a_marker_is_turned_away_where_it_is_from_every_view_that_saw_it_at_rest():
+    """Of two views; half of the markers are lost. A view that did not see a marker at rest has no say."""
+    u, v = torch.meshgrid(torch.linspace(-9, 9, 12), torch.linspace(-9, 9, 12), indexing="ij")
+    positions = torch.stack([u, v, 0 * u + 3], -1).reshape(-1, 3).double()
+    lost, ones = positions[:, 0] > 0, torch.ones(2, len(positions), dtype=torch.float64)
+    found = torch.where(lost, 0.0, ones)
+
+    def in_view(seen, *turned):
+        coverage = Coverage(spherical_cap(12, 0.5, 3, (33, 33)), positions, seen.flatten(), ones.flatten())
+        facing = torch.stack([torch.where(lost, 0.1 if away else 0.9, 1.0) for away in turned]).double()
+        return float(coverage.in_view((found * seen).flatten()[None], facing.flatten()[None]))
+
+    both, first = ones > 0, torch.stack([torch.ones(144), torch.zeros(144)]) > 0
+    whole, hidden = pytest.approx(1.0), pytest.approx(0.57, abs=0.04)
+    assert [in_view(both, *turned) for turned in ((True, True), (True, False), (False, False))] == [whole, hidden, hidden]
+    assert [in_view(first, *turned) for turned in ((True, False), (False, True))] == [whole, hidden]
+
+
 def test_markers_that_the_press_turns_away_are_not_hidden(fingertip, monkeypatch):
     """Of a dent whose walls are seen at a grazing angle: lost markers on the walls are its doing, as many others are not."""
     reconstructor = fingertip[1]

@@ -286,3 +286,12 @@ def test_a_log_by_time_that_fits_no_image_is_refused(inputs, rows, said, tmp_pat
     with pytest.raises(MembraneError) as refusal:
         read_pressures(tmp_path / "log.csv", inputs, MM)
     assert said in str(refusal.value)
+
+
+def test_a_reading_is_used_up_to_its_reach_before_and_after_a_frame(tmp_path):
+    """Readings every 2 s: half as long again."""
+    (tmp_path / "log.csv").write_text("time,pressure_change\n" + "".join(f"{1790509109 + t},{10 * t}\n" for t in (0, 2, 4)))
+    found = read_pressures(tmp_path / "log.csv", TAKEN, MM)
+    assert found.reach == 3.0
+    near, far = ([1e4 * found.at("", BEGUN + t) for t in times] for times in ((-3.0, 7.0), (-3.25, 7.25)))
+    assert near == pytest.approx([0.0, 40.0]) and np.isnan(far).all()

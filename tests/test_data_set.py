@@ -45,7 +45,12 @@ def test_the_card_says_sensor_units_and_statuses(recording, tmp_path):
     assert card.startswith("---\npretty_name: press\n") and "path: train/*\n---" in card
     for said in (f"| sensor | {mesh.name} |", f"| force unit | {mesh.force_unit} |", "| 0 | ok | 2 |", "| 4 | blank or"):
         assert said in card
-    assert "| `wrench` | N, N mm |" in card and "| `traction` | N/mm^2 |" in card
+    lengths, powers = ("vertices", "displacement", "markers", "contact_points", "depth_deviation"), {"contact_area": "mm^2"}
+    units = dict.fromkeys(lengths, "mm") | powers | {"contact_curvature": "1/mm", "wrench": "N, N mm"}
+    units |= dict.fromkeys(("traction", "pressure", "pressure_change"), "N/mm^2")
+    units |= dict.fromkeys(("force", "contact_force", "force_deviation"), "N") | dict.fromkeys(("pixels", "residual"), "px")
+    for array, unit in units.items():
+        assert f"| `{array}` | {unit} |" in card
 
 
 def test_without_images_there_are_frames_alone_and_some_are_refused(recording, tmp_path, capsys):

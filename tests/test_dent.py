@@ -61,6 +61,16 @@ def test_the_middle_of_a_contact_is_dented_inwards_along_the_normals(estimator, 
     assert (depth[DOME.fixed] == 0).all()
 
 
+def test_a_dent_is_a_bell_whose_standard_deviation_is_its_width(estimator):
+    """Ridges of a contact's square around it: what its depth falls to at one and at one and a half widths."""
+    vertex = vertex_near(0, 0)
+    depth = -(dented(estimator, [vertex]) * DOME.rest_normals).sum(-1)
+    away = (DOME.rest - DOME.rest[vertex]).norm(dim=-1) / (WIDTH * DOME.size)
+    near = (away > 0.5) & (away < 1.8)
+    assert near.sum() > 12
+    torch.testing.assert_close(depth[near] / depth.max(), torch.exp(-away[near].square() / 2), rtol=0.2, atol=0.02)
+
+
 def test_contacts_nearer_than_their_reach_have_one_middle(estimator):
     apart = 0.5 * REACH * DOME.size / 2
     depth = dented(estimator, [vertex_near(-apart, 0), vertex_near(apart, 0)]).norm(dim=-1)

@@ -26,6 +26,7 @@ from torchmembrane.markers.dots.pattern import DotPattern, find_dots, measure_do
 from torchmembrane.markers.dots.probability import own_evidence
 from torchmembrane.markers.dots.pyramid import mean_pyramid
 from torchmembrane.markers.dots.steps import NeighbourSteps
+from torchmembrane.markers.spacing import partly_in_view
 
 SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
 PATTERNS = [("square", True), ("square", False), ("hexagonal", True), ("hexagonal", False)]
@@ -718,3 +719,14 @@ def test_a_blob_that_is_probably_no_dot_costs_the_logarithm_of_its_probability()
     radius, valid = torch.tensor([[0.0, 0.3, -0.2]]).double(), torch.tensor([[1.0, 0.6, 0.02]]).double()
     more = match.misfit(radius, valid) - match.misfit(radius, torch.ones_like(valid))
     torch.testing.assert_close(more, (-2 * valid.log())[:, None].expand_as(more))
+
+
+def test_a_dot_is_partly_in_view_where_its_outline_reaches_into_the_image_s_rows_and_columns():
+    """Slanted ellipses of all kinds about the image's border, by points of their outlines."""
+    rng = np.random.default_rng(0)
+    pixels, shapes = rng.uniform(-10, 30, (400, 2)), rng.uniform(-6, 6, (400, 2, 2))
+    angle = np.linspace(0, 2 * np.pi, 4001)
+    outline = pixels[:, None] + np.stack([np.cos(angle), np.sin(angle)], -1) @ shapes.swapaxes(1, 2)
+    expected = ((outline.max(1) > 0) & (outline.min(1) < [19, 11])).all(1)
+    assert 100 < expected.sum() < 300
+    np.testing.assert_array_equal(partly_in_view(pixels, shapes, (20, 12)), expected)

@@ -23,6 +23,7 @@ from PIL import Image
 
 from torchmembrane.files.provenance import SourceFile
 from torchmembrane.onnx.export import sealed
+from torchmembrane.pose import Pose
 from torchmembrane.results.summary_row import NAMES
 
 ROOT = Path(__file__).parents[1]
@@ -690,16 +691,36 @@ def test_each_frame_s_line_says_status_and_force(model, call, images, tmp_path):
     assert last.startswith("frames: 1 reconstructed, 1 failed") and "blank or saturated" in err
 
 
+def test_a_batch_s_time_is_shared_by_its_images_and_rows_are_in_the_order_of_their_numbers(
+    model, call, images, tmp_path, monkeypatch
+):
+    """Of three images in six seconds each takes two; the tenth comes after the second, however a table is begun."""
+    from torchmembrane_edge import cli
+
+    clock = iter((0.0, 6.0, 10.0, 11.0))
+    monkeypatch.setattr(cli, "time", types.SimpleNamespace(perf_counter=lambda: next(clock)))
+    made = [images(f"press_{number}.png", GREY) for number in (2, 10, 11)]
+    _, out, _ = call(model, *made, "--out", tmp_path / "r", "--batch", 3)
+    assert [line.rpartition(", ")[2] for line in out.splitlines()[:3]] == ["2000 ms"] * 3
+    call(model, images("press_9.png", GREY), "--out", tmp_path / "r")
+    rows = rows_of(tmp_path / "r")
+    assert list(rows) == ["press_2", "press_9", "press_10", "press_11"]
+    assert [float(row["seconds"]) for row in rows.values()] == [2.0, 1.0, 2.0, 2.0]
+
+
 def test_contacts_are_told_with_place_and_force(edge):
     session = types.SimpleNamespace(
         length_unit="mm", force_unit="N", status_text=lambda code: "ok", mesh={"rest_normals": np.ones((1, 3))}
     )
     points = np.full((4, 3), np.nan)
     points[:2] = [[1, 2, 3], [4, 5, 6]]
-    frame = {"status": 0, "displacement": np.ones((1, 3)), "vertices": np.ones((1, 3)), "force": np.array([0.0, 3.0, 4.0])}
+    moved = np.array([[-2.0, 3.0, 6.0]])
+    frame = {"status": 0, "displacement": moved, "vertices": np.ones((1, 3)), "force": np.array([0.0, 3.0, 4.0])}
     frame |= {"contact_points": points, "contact_force": 2 * points, "contact_area": points[:, 0]}
     said = edge.cli.line(session, frame)
-    assert said.endswith("force 5 N (0, 3, 4), contact at (1, 2, 3) mm of 7.48 N, contact at (4, 5, 6) mm of 17.5 N")
+    assert said.endswith(
+        "by at most 7 mm, force 5 N (0, 3, 4), contact at (1, 2, 3) mm of 7.48 N, contact at (4, 5, 6) mm of 17.5 N"
+    )
 
 
 @pytest.mark.parametrize("made, warned", [("99.0.0", True), ("0.0.9", False), (None, False), ("nonsense", False)])
@@ -865,3 +886,10 @@ def test_a_wrench_without_tool_or_of_other_results_is_refused(edge, model, tmp_p
     for wrong in ({}, None, {"wrench": np.zeros(6)}, {"wrench": "x"}):
         with pytest.raises(edge.EdgeError, match="expected results of `run`"):
             session.wrench_in_tool(wrong)
+
+
+def test_a_wrench_is_carried_to_the_tool_as_torchmembrane_s_pose_does_it(edge, tmp_path):
+    pose = Pose(np.array([20.0, -50.0, 70.0]), np.array([3.0, -1.0, 12.0]))
+    path, wrench = tmp_path / "tool.onnx", np.random.default_rng(0).normal(size=(5, 6)).astype(np.float32)
+    path.write_bytes(model_of(metadata({"camera_in_tool": np.column_stack([pose.rotation, pose.translation]).tolist()})))
+    np.testing.assert_allclose(edge.Session(path).wrench_in_tool({"wrench": wrench}), pose.wrench(wrench), atol=1e-4)

@@ -4,6 +4,7 @@
 """
 
 import json
+import os
 
 import numpy as np
 import onnx
@@ -108,6 +109,19 @@ def test_the_command_takes_the_files_of_each_view(model, tmp_path, capsys):
         (tmp_path / f"broken_{name}.png").write_bytes(b"no image")
     assert main([str(model), f"{tmp_path}/broken*.png", "--out", str(out)]) == 1
     assert "view left: " in (said := capsys.readouterr().err) and "view right: " in said
+
+
+@pytest.mark.parametrize("latest", SIZES)
+def test_the_source_of_a_frame_is_that_of_all_views_files_as_torchmembrane_has_it(latest, tmp_path):
+    """Size, hash and the time of the latest change, whichever view's file it is."""
+    files = [tmp_path / f"press_{name}.png" for name in SIZES]
+    for name, image, file in zip(SIZES, images(100, 10), files, strict=True):
+        Image.fromarray(image[0]).save(file)
+        os.utime(file, (1.7e9 + 60 * (name == latest),) * 2)
+    (frame,) = view_frames(files[0], list(SIZES), list(SIZES.values()), None)
+    expected = SourceFile.from_files(*files)
+    known = ("path", "file_size", "file_modified", "content_hash")
+    assert {key: frame.origin[key] for key in known} == {key: getattr(expected, key) for key in known}
 
 
 def test_pictures_of_a_stack_that_one_view_lacks(model, tmp_path, capsys):

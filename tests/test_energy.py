@@ -316,3 +316,12 @@ def test_a_step_of_the_cavity_s_condition_ends_on_its_law(filling, gas, error):
     volume = law.rest_volume + rise + target - compliance * step
     expected = law.target_volume(volume, pressure + step)
     torch.testing.assert_close(volume, expected, rtol=0, atol=2600 * error + 1e-9)
+
+
+@pytest.mark.parametrize("filling, gas", [("liquid", None), ("gas", (0.1, 2600.0)), ("open", None)])
+def test_a_volume_is_off_by_a_share_of_the_volume_at_rest(filling, gas):
+    """Of what its law requires at the pressure; an open cavity's may be any."""
+    law = CavityLaw(spherical_cap(12, 9, 3, (9, 9)), torch.tensor(0.02, dtype=torch.float64), filling, gas)
+    pressure, off = torch.tensor([0.02, 0.05, 0.05], dtype=torch.float64), torch.tensor([-0.2, 0.0, 0.3], dtype=torch.float64)
+    volume = law.target_volume(law.rest_volume, pressure) + off * law.rest_volume
+    torch.testing.assert_close(law.volume_error(volume, pressure), 0 * off if filling == "open" else off)

@@ -19,7 +19,7 @@ from torchmembrane.forming.outline import ellipse, outline_of, rectangle
 from torchmembrane.forming.sheet_energy import SheetEnergy
 from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.presets.blown_up import Stated, blown_up
+from torchmembrane.presets.blown_up import Stated, _distance, blown_up
 from torchmembrane.sensor.factories import elastic_energy
 from torchmembrane.sensor.inflated import InflatedSurface
 from torchmembrane.surface.membrane import Membrane
@@ -325,3 +325,32 @@ def test_a_rest_surface_is_the_same_without_gradients(mode):
         found = film(rim, 9).vertices
     outline_grid_module._outline_grid.cache_clear()
     np.testing.assert_array_equal(found, film(rim, 9).vertices)
+
+
+def test_a_dot_keeps_clear_of_the_sides_of_a_rim_not_of_the_lines_through_them():
+    """An L: in its corner the lines through the notch's sides run across the membrane."""
+    rim = np.array([[0.0, 0], [6, 0], [6, 2], [2, 2], [2, 6], [0, 6]])
+    share = np.linspace(0, 1, 4001)[:, None]
+    sides = np.concatenate([a + share * (b - a) for a, b in zip(rim, np.roll(rim, -1, 0), strict=True)])
+    points = np.random.default_rng(0).uniform(0, 6, (200, 2))
+    expected = np.linalg.norm(points[:, None] - sides, axis=-1).min(1)
+    np.testing.assert_allclose(_distance(rim, points), expected, atol=2e-3)
+
+
+def test_an_outline_s_frame_leads_back_to_its_points():
+    """An irregular tilted polygon with more points on one side: its origin is the middle of its area."""
+    rng = np.random.default_rng(0)
+    angle = np.sort(np.concatenate([rng.uniform(0, 2, 12), np.linspace(2, 6, 7)]))
+    flat = np.stack([9 * np.cos(angle), 6 * np.sin(angle), rng.uniform(-0.2, 0.2, 19)], -1)
+    X = flat @ Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix().T + [3.0, -2.0, 40.0]
+    outline = outline_of(X)
+    np.testing.assert_allclose(outline.camera_frame(np.column_stack([outline.points, outline.heights])), X, atol=1e-12)
+    p, q = outline.points, np.roll(outline.points, -1, 0)
+    cross = p[:, :1] * q[:, 1:] - p[:, 1:] * q[:, :1]
+    np.testing.assert_allclose(((p + q) * cross).sum(0), 0, atol=1e-9)
+
+
+def test_samples_of_a_rim_are_at_equal_steps_once_around():
+    samples = outline_of(raised(ellipse((40.0, 40.0)))).sampled(24)
+    steps = np.linalg.norm(np.roll(samples, -1, 0) - samples, axis=1)
+    np.testing.assert_allclose(steps, 40 * np.sin(np.pi / 24), rtol=1e-3)

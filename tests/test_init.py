@@ -12,6 +12,7 @@ import torch
 from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.calibrate.rim import find_rim
 from torchmembrane.cli.main import main
+from torchmembrane.presets.annotate import annotate
 from torchmembrane.presets.dot_list import read_drafted_dots
 from torchmembrane.presets.draft import (
     RimCircle,
@@ -82,6 +83,16 @@ def test_the_overpressure_is_that_of_a_neo_hookean_sphere(unit):
     assert overpressure(membrane, blown_up, unit) == pytest.approx(p, rel=5e-3)
 
 
+@pytest.mark.parametrize("unit", METRE)
+def test_what_is_proposed_in_comments_is_the_same_in_every_unit(unit, tmp_path):
+    path, one = tmp_path / "sensor.toml", METRE[unit] / 1000
+    path.write_text("[material]\nprestretch = 1.2\n")
+    annotate(path, [], True, unit)
+    proposed = {key: float(value) for key, value in re.findall(r"^# (\w+) = ([-+.e\d]+)", path.read_text(), re.MULTILINE)}
+    lengths = {"distance": 2.0 * one, "shear_modulus": 0.3 / one**2}  # 0.3 N/mm^2
+    assert {key: proposed[key] for key in lengths} == pytest.approx(lengths, rel=1e-5) and proposed["index"] == 1.33
+
+
 def test_of_overpressure_prestretch_and_modulus_any_two_give_the_third():
     membrane = drafted_surface("cap", {"radius": 12.0, "height": 7.0}, 20.0).membrane((33, 33))
     held = overpressure(membrane, Material("neo_hookean", 1.3, None, 0.4, 0.5), "mm")
@@ -115,6 +126,13 @@ def test_dots_are_the_same_in_whatever_frame_they_are_given(tmp_path, shape):
         path.write_text("\n".join([f"{header},size", *rows]) + "\n")
         got, got_sizes = read_drafted_dots(path, surface, camera)
         assert got_sizes == sizes and np.abs(got - X).max() < 0.02, header
+
+
+def test_a_pitch_that_gives_too_many_dots_is_refused_with_their_number():
+    """The area of half a sphere over the pitch's square."""
+    with pytest.raises(MembraneError, match=r"a pitch of 0.05 gives (\d+) dots; expected one that gives 8 to") as refused:
+        drafted_dots(drafted_surface("dome", {"radius": 12.0}, 15.0), 0.05)
+    assert int(re.search(r"gives (\d+) dots", str(refused.value))[1]) == pytest.approx(2 * np.pi * (12 / 0.05) ** 2, rel=0.02)
 
 
 @pytest.mark.parametrize("model", ["pinhole", "fisheye"])
@@ -195,6 +213,15 @@ def test_an_ellipse_is_found_whether_lighter_or_darker_outside(outside, markers)
     rim = find_rim(image + 0.02 * np.random.default_rng(0).standard_normal(image.shape), dots if markers else None)
     assert [*rim.centre, *rim.half_axes] == pytest.approx([150, 125, 110, 90], abs=0.3)
     assert rim.share > 0.95
+
+
+@pytest.mark.parametrize("radius", [80.0, 80.25, 80.5, 80.75])
+def test_a_rim_is_found_between_the_pixels(radius):
+    """Of a blurred edge without noise."""
+    v, u = np.mgrid[:240, :320]
+    image = 0.2 + 0.6 / (1 + np.exp((np.hypot(u - 160.3, v - 118.8) - radius) / 0.8))
+    rim = find_rim(image)
+    assert [*rim.centre, *rim.half_axes] == pytest.approx([160.3, 118.8, radius, radius], abs=0.03)
 
 
 def test_a_rim_that_is_not_in_the_image_is_not_found():

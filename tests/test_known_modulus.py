@@ -128,6 +128,7 @@ def test_the_modulus_from_a_gauge_at_rest_holds_the_rest_surface():
     p0 = float(rest_balance(sensor.membrane, elastic_energy(sensor, sensor.membrane))[0]) * 1e4
     found = modulus_at_rest(sensor, stretch, 0.05, p0)
     assert found.modulus == pytest.approx(sensor.material.modulus, rel=1e-9) and found.change < 0  # more tension, less modulus
+    assert -found.change == pytest.approx(max(abs(side - found.modulus) for side in found.sides))
     window = blown_up({"outline": "ellipse", "size": [50.0, 36.0], "base_z": 40.0}, "mm", Stated(6.0, 12.0, 1.1, None, 0.2))
     sensor = replace(
         sensor,
@@ -136,4 +137,8 @@ def test_the_modulus_from_a_gauge_at_rest_holds_the_rest_surface():
         material=window.material,
         markers=replace(sensor.markers, positions=None, sizes=None),
     )
-    assert modulus_at_rest(sensor, np.log(1.1), 0.02, 12.0).modulus == pytest.approx(window.material.modulus, rel=1e-4)
+    surface = window.surface.of_height(6.3)
+    higher = replace(sensor, surface=surface, membrane=surface.membrane((17, 17)))
+    found, other = (modulus_at_rest(each, np.log(1.1), 0.02, 12.0, higher) for each in (sensor, higher))
+    assert found.modulus == pytest.approx(window.material.modulus, rel=1e-4)
+    assert found.by_height == pytest.approx(other.modulus - found.modulus) and found.by_height < 0 == other.by_height

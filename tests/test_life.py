@@ -12,6 +12,7 @@ import torchmembrane as tm
 from torchmembrane.live.peaks import Peaks
 from torchmembrane.results.store import Mesh
 from torchmembrane.stiffness import LEAST_DEVIATION, LEAST_OFF, MEMORY, SURE, StiffnessWatch
+from torchmembrane.track import FOUND_PRESSURE_ERROR
 
 
 def watched(ratios, known=2.0):
@@ -76,6 +77,17 @@ def test_a_gauge_tells_the_same_of_pressures(pressed):
     with pytest.warns(UserWarning, match="stiffened"):
         for _ in range(5):
             assert tracker.gauge(1.25 * change) == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_comparison_of_pressures_is_as_sure_of_a_fall_as_of_a_rise(pressed, sign):
+    reconstructor, image = pressed
+    tracker = tm.Tracker(reconstructor)
+    result = tracker(image)
+    change = sign * result.pressure_change.abs()
+    tracker._latest_result = result._replace(pressure_change=change)
+    assert tracker.gauge(float(change)) == pytest.approx(1.0)
+    assert tracker.stiffness.deviation == pytest.approx(FOUND_PRESSURE_ERROR)
 
 
 def test_a_load_that_tells_nothing_is_refused(pressed):

@@ -143,6 +143,8 @@ def test_known_loads_are_compared_with_the_latest_frame(stream, small_images):
     assert "the force is found 0.500 times as large as known" in answer and stream.tracker.stiffness.ratio < 0.51
     answer = request_of(f"{change / 1e-4 / 2:.6f}hPa", "mm")(stream)
     assert "the change of pressure is found 2.000 times" in answer
+    watch = stream.tracker.stiffness
+    assert f"together {watch.ratio:.3f}, {watch.deviation:.0%} uncertain: a calibration is due" in answer and watch.ratio < 1.9
 
 
 def test_a_mailbox_that_ended_gives_its_last_picture_first():

@@ -97,6 +97,21 @@ def test_of_a_measured_force_counts_what_is_along_the_one_that_is_found():
         assert ratios == pytest.approx([ratio]) and magnitudes.ravel() == pytest.approx([2.0, 3.0])
 
 
+def test_forces_that_scatter_leave_the_error_of_their_mean():
+    """Ratios of measured to found forces, each known to a tenth: their own scatter where that is larger, else the tenth."""
+    material, cavity = SimpleNamespace(modulus=0.4), SimpleNamespace(filling="liquid")
+    reconstructor = SimpleNamespace(sensor=SimpleNamespace(material=material), estimator=SimpleNamespace(cavity=cavity))
+    for ratios in (np.array([0.8, 1.6, 1.1, 2.1]), np.array([1.19, 1.21, 1.2, 1.2])):
+        given = SimpleNamespace(
+            reconstructor=reconstructor,
+            _refuse_unpressed=lambda *_: None,
+            _ratios=lambda *_, ratios=ratios: (ratios, np.stack([np.ones(4), ratios], 1)),
+        )
+        modulus, deviation, *_ = Presses.modulus(given, 0.1, 0.02, KnownForces(np.ones((4, 1))))
+        assert modulus == pytest.approx(0.4 * ratios.mean())
+        assert deviation / modulus == pytest.approx(max(0.1, ratios.std(ddof=1) / ratios.mean()) / 4**0.5)
+
+
 @pytest.mark.filterwarnings("ignore:.*acts as a liquid")
 @pytest.mark.usefixtures("calibration_grids")
 def test_a_gas_of_unknown_modulus_is_found_as_one_whose_file_says_it(presses):
@@ -117,6 +132,12 @@ def test_the_figure_marks_one_deviation_on_either_side_of_the_prestretch():
     figure = material_figure(report, SimpleNamespace(profile=profile, forces=none, pressures=none), [])
     (span,) = figure.axes[0].patches
     assert span.get_extents().transformed(figure.axes[0].transData.inverted()).intervalx == pytest.approx([1.3, 1.5])
+
+
+def test_a_report_says_how_far_points_are_off_on_either_side():
+    none, off = np.zeros(0), np.array([[0.3, 0.0], [0.0, -0.5]])
+    report = Report("lens", [], [], none, none, none, np.zeros((0, 0)), off, off, 0.1, [])
+    assert report.lines == ["lens", "  residuals: 2 points, 0.292 px rms, at most 0.500 px"]
 
 
 def test_rest_tells_no_prestretch():

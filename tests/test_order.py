@@ -13,7 +13,7 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
-from torchmembrane.files.order import in_order
+from torchmembrane.files.order import in_order, warn_of_times
 from torchmembrane.jobs.inputs import find_inputs, without_rest
 from torchmembrane.jobs.rest import recording_rest
 from torchmembrane.live.sources import folder_images
@@ -124,6 +124,17 @@ def test_times_that_go_against_the_numbers_are_said(tmp_path, small_sensor, monk
         with pytest.warns(UserWarning, match=words) if said else warnings.catch_warnings():
             warnings.simplefilter("always" if said else "error")
             take()
+
+
+def test_times_that_go_back_in_small_steps_are_said_once_they_have_gone_far_enough():
+    """Each file is 0.4 s older than the one before, which copies at once may be; the fourth is 1.2 s older than the first."""
+    frames = [(f"f_{k}", 100.0 - 0.4 * k) for k in range(8)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_times(frames[:3])
+    with pytest.warns(UserWarning, match="f_3 follows f_0 by the numbers in their names, but is older by 1 s") as found:
+        warn_of_times(frames)
+    assert len(found) == 1
 
 
 def test_results_and_their_summary_are_in_order(tmp_path, small_sensor):

@@ -1,5 +1,7 @@
 """Simulated presses obey closed forms, force balance and friction."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate import equilibrium as equilibrium_module
 from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
+from torchmembrane.simulate.frictional_contact import FrictionalContact
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
 from torchmembrane.simulate.quasi_static import carried, press, presses
 from torchmembrane.solve.stencil import ONE_RING, apply_stencil, inner, one_ring_edges
@@ -291,3 +294,29 @@ def test_wrong_arguments_are_refused(dome):
     ):
         with pytest.raises(MembraneError, match=message):
             press(dome, elasticity, paths, **options)
+
+
+def test_a_vertex_is_carried_from_where_the_body_meets_it():
+    """A plate moved by 1.5 down and 0.6 sideways: one vertex it meets at two thirds, one it holds, one it never meets."""
+    plate, travel = Plane(rotation=facing((0, 0, -1.0)), translation=(0, 0, 1.0)), torch.tensor([0.6, 0.0, -1.5]).double()
+    x = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 1.0], [4.0, 0.0, -3.0]], dtype=torch.float64)
+    contact = FrictionalContact.at_first_pose(plate, x, 1.0, 0.3)
+    contact = contact._replace(normal=torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64))
+    carried_by = contact.carried_to(plate.moved(travel), x).anchor - x
+    torch.testing.assert_close(carried_by, torch.tensor([[1 / 3], [1.0], [0.0]]).double() * travel)
+
+
+def test_a_body_that_turns_goes_by_increments_of_what_its_farthest_points_travel(dome, monkeypatch):
+    """A ball turned by half a radian on the spot, with steps of a tenth of the surface's size."""
+    solve, turns = EquilibriumProblem.solve, []
+
+    def watched(problem, x, pressure, contacts=()):
+        turns.append(contacts[0].indenter.rotation)
+        return solve(problem, x, pressure, contacts)
+
+    monkeypatch.setattr(EquilibriumProblem, "solve", watched)
+    ball, c, s = tip(dome).moved((0, 0, -0.3)), np.cos(0.5), np.sin(0.5)
+    turned = ball.at(ball.translation, torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
+    press(dome, elasticity_of(dome), [[ball, turned]], increment=0.1 * dome.size)
+    steps = [float(((before.T @ after).trace() - 1).div(2).clamp(-1, 1).acos()) for before, after in pairwise(turns)]
+    assert max(steps) < 0.1 + 1e-6 and sum(steps) == pytest.approx(0.5, abs=1e-6)

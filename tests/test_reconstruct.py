@@ -380,3 +380,17 @@ def test_what_is_found_without_gradients_can_be_used_where_they_are_taken(sensor
     leaf = found.pixels.clone().requires_grad_()
     (reconstructor.from_pixels(leaf, found.confidence).force * found.force).sum().backward()
     assert leaf.grad.abs().max() > 0
+
+
+def test_an_image_is_saturated_where_nearly_all_of_it_is_white_and_dark_where_it_is_black(reconstructor):
+    """A hundredth of the pixels are of the other kind: white dots on black are seen, a white image is not."""
+    few = torch.rand(1, 1, 480, 640) < 0.01
+    status = reconstructor.observer.check(torch.cat([few, ~few, torch.rand(1, 1, 480, 640) < 0.5]).float())
+    assert status.tolist() == [Status.OK, Status.BLANK, Status.OK]
+
+
+def test_the_noise_of_a_rest_state_falls_with_the_number_of_its_images(reconstructor):
+    image = reconstructor.read(EXAMPLES / "rest.png")
+    one, four = (reconstructor.observer.rest_of(image.expand(count, -1, -1, -1)) for count in (1, 4))
+    torch.testing.assert_close(four.pixels, one.pixels, rtol=0, atol=1e-3)
+    torch.testing.assert_close(four.covariance, one.covariance / 4, rtol=1e-3, atol=1e-9)

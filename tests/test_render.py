@@ -11,10 +11,11 @@ from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy, vignette
+from torchmembrane.simulate.appearance import LIGHT_RADIUS, Appearance, blurred, diffuse_light, noisy, vignette
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
 from torchmembrane.simulate.raster import visible_triangles
 from torchmembrane.simulate.render import Renderer, render
+from torchmembrane.surface.shapes import heightfield
 
 SIZE = (160, 120)
 PORT = {"ports": [(2.0, 3.0, 1.49)], "medium_index": 1.33}
@@ -156,6 +157,17 @@ def test_light_falls_with_the_square_of_the_distance_and_the_cosine():
     tilted = diffuse_light(torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.6, 0, -0.8]]), lights)
     assert near / far == pytest.approx(4) and tilted / near == pytest.approx(0.8)
     assert diffuse_light(torch.tensor([[0.0, 0, 2]]), -up, lights) == 0
+
+
+def test_lights_stand_round_the_camera_half_as_far_as_the_membrane_at_most():
+    """Of a membrane far away, a share of the rim's distance from the axis; of one as near as a window's, half its distance."""
+    x = np.linspace(-20, 20, 9)
+    for z, radius in ((60.0, LIGHT_RADIUS * np.hypot(*np.meshgrid(x, x))), (4.0, 2.0)):
+        plate = heightfield(x, x, np.full((9, 9), z))
+        wanted = radius if z == 4.0 else float(radius[plate.fixed.reshape(9, 9).numpy()].mean())
+        lights = Appearance().lights_for(plate)
+        torch.testing.assert_close(lights.norm(dim=1), torch.full((4,), wanted).double())
+        torch.testing.assert_close(lights.mean(0), torch.zeros(3).double(), rtol=0, atol=1e-9)
 
 
 def test_a_highlight_lies_where_the_plate_mirrors_the_light():

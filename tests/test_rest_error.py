@@ -70,3 +70,14 @@ def test_presses_that_contradict_one_another_tell_no_less_of_the_prestretch_than
     shapes = by_shapes(LossProfile(STRETCHES, losses))
     assert (shapes.deviation == UNKNOWN) == is_bounded and shapes.deviation <= UNKNOWN
     assert UNKNOWN == pytest.approx(np.random.default_rng(0).uniform(z[0], z[-1], 10**6).std(), rel=1e-3)
+
+
+def test_an_error_that_images_share_adds_to_the_variance_of_each():
+    """Of two images whose losses are parabolas about other prestretches."""
+    stretches = np.geomspace(1.05, 1.9, 41)
+    off = np.log(stretches)[:, None] - np.log([1.3, 1.4])
+    profile = LossProfile(stretches, off**2 / (2 * 0.03**2))
+    alone, shared = by_shapes(profile, 0.0), by_shapes(profile, 0.05)
+    np.testing.assert_allclose(shared.variances, alone.variances + 0.05**2)
+    np.testing.assert_allclose(shared.each, alone.each)
+    assert shared.mean == alone.mean and shared.deviation > np.hypot(shared.by_losses, 0.05) * (1 - 1e-9)

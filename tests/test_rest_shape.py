@@ -11,6 +11,7 @@ from torchmembrane.cli.main import main
 from torchmembrane.cli.rest_words import rest_in_words
 from torchmembrane.presets.blown_up import Stated, blown_up, sheet_dots
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.surface.membrane import Membrane
 
 RIM = {"outline": "rectangle", "size": [50.0, 36.0], "corner": 4.0, "base_z": 40.0}
 RUBBER = Material("neo_hookean", 1.06 * 1.036, None, 0.2551, 0.2 / 1.036**2)  # at rest, what the sheet of 1.06 is in the mean
@@ -47,6 +48,27 @@ def test_a_sheet_that_is_given_as_a_grid_is_found_again(window):
 def test_a_sheet_is_its_own_equilibrium_and_has_no_other(window):
     found = rest_shape(window)
     assert found.left_over < 1e-6 and found.nearest is None and found.pressure * 1e4 == pytest.approx(12.0, rel=1e-5)
+
+
+def test_a_dent_counts_towards_the_distance_from_the_nearest_sheet(window):
+    """Of a sheet pressed in by 0.8 mm in the middle, by the points of the sheet of the height that is said."""
+    X = window.surface.formed.vertices.copy()
+    X[..., 2] -= 0.8 * np.exp(-(X[..., 0] ** 2 + X[..., 1] ** 2) / 20)
+    membrane = Surface.from_membrane(Membrane(X)).membrane((33, 33))
+    dented = replace(window, surface=Surface.from_membrane(membrane), membrane=membrane, material=RUBBER)
+    nearest = rest_shape(dented).nearest
+    off = window.surface.of_height(nearest.height).membrane((33, 33)).closest_points(X.reshape(-1, 3)).distance
+    assert nearest.most == pytest.approx(off.max(), rel=0.1) and nearest.most > 0.4
+    assert nearest.distance == pytest.approx((off**2).mean() ** 0.5, rel=0.1)
+
+
+def test_a_prestretch_below_what_inflation_alone_gives_is_said(window):
+    sheet = replace(window, surface=Surface.from_membrane(window.membrane), material=RUBBER)
+    said = "less than inflation alone gives such a sheet, 1.0"
+    assert said not in "\n".join(rest_in_words(sheet))
+    assert f"a prestretch of 1.02 at rest is {said}" in "\n".join(
+        rest_in_words(replace(sheet, material=replace(RUBBER, prestretch=1.02)))
+    )
 
 
 @pytest.mark.parametrize(

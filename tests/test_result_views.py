@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torchmembrane_edge import view_status as edge_status
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
+from torchmembrane.results import view_status
 from torchmembrane.results.npz import save_frame
 from torchmembrane.results.point_cloud import save_contact_cloud
 
@@ -55,3 +57,16 @@ def test_the_command_writes_the_contact_as_a_cloud_that_others_read(result, tmp_
     assert save_contact_cloud(tmp_path / "half.ply", half) == 3
     nothing = frame | {"contact": np.full_like(frame["contact"], np.nan)}
     assert save_contact_cloud(tmp_path / "none.ply", nothing) == 0
+
+
+@pytest.mark.parametrize(
+    ("by", "moved"),
+    [(0, 1.1), (1, -1.1), (2, 0.4), (2, -0.4), (3, 0.006), (3, -0.006), (0, 0.9), (2, -0.2), (3, 0.004), (3, -0.004)],
+)
+def test_a_view_has_moved_where_its_image_has_shifted_turned_or_scaled_either_way(by, moved):
+    """Beyond 1 px, 0.3 degrees or 0.5 %; in the words of the package for edge devices too."""
+    motion = np.array([[0.0, 0.0, 0.0, 1.0]] * 2)
+    motion[1, by] += moved
+    expected = ["right"] if abs(moved) > (1.0, 1.0, 0.3, 0.005)[by] else []
+    for moved_views in (view_status.moved_views, edge_status.moved_views):
+        assert moved_views({"camera_motion": motion}, ["left", "right"]) == expected

@@ -44,6 +44,26 @@ def test_frames_are_the_camera_s_on_the_tool(tmp_path):
     assert np.linalg.norm(expected[:, None] - loaded[None], axis=-1).min(1).max() < 1e-7
 
 
+def test_the_camera_s_field_of_view_is_that_of_the_image_s_height(tmp_path):
+    """A pinhole of that field of view has the sensor's focal length along v."""
+    sensor = tm.preset("bubble")
+    lens = tm.Camera("pinhole", (640, 360), (440.0, 410.0), (320.0, 180.0))
+    write_robot_model(replace(sensor, camera=lens, markers=replace(sensor.markers, rest_image=None)), tmp_path)
+    camera = ElementTree.parse(tmp_path / "bubble.xml").find("worldbody/body/camera")
+    assert 180 / np.tan(np.radians(float(camera.get("fovy"))) / 2) == pytest.approx(410.0, rel=1e-4)
+    assert camera.get("resolution") == "640 360"
+
+
+def test_normals_in_the_meshes_are_those_of_their_triangles_by_the_right_hand(tmp_path):
+    write_robot_model(tm.preset("bubble"), tmp_path)
+    for mesh in ("membrane", "rim"):
+        content = (tmp_path / f"{mesh}.stl").read_bytes()
+        rows = np.frombuffer(content[84:], [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        a, b, c = rows["corners"].transpose(1, 0, 2).astype(float)
+        normal = np.cross(b - a, c - a)
+        np.testing.assert_allclose(rows["normal"], normal / np.linalg.norm(normal, axis=1, keepdims=True), atol=1e-4)
+
+
 @pytest.mark.parametrize("pitch", [-np.pi / 2, -0.4, 0.0, 1.2, np.pi / 2])
 def test_angles_give_their_rotation_back(pitch):
     rotation = turned(2, 0.7) @ turned(1, pitch) @ turned(0, -2.1)

@@ -14,6 +14,7 @@ from torchmembrane.files.images import GREY
 from torchmembrane.integrations.messages import (
     MOSAICS,
     PLANES,
+    SAMPLES,
     camera_mismatch,
     grey_of,
     info_topic,
@@ -265,6 +266,18 @@ def test_another_mode_than_the_file_s_is_refused_with_the_remedy(region, binning
     camera = full_camera("plumb_bob").in_mode(*camera_mode)
     with pytest.raises(MembraneError, match=f"CameraInfo is {said}.*say so in the file's .camera"):
         camera_mismatch(camera_info("plumb_bob", region, binning, size), camera)
+
+
+def test_what_the_lens_of_a_camera_info_does_not_see_counts_as_the_image_s_diagonal():
+    """A fisheye of 244 degrees and a pinhole: the tangent of the angle for the angle, 800 px at most, and behind it 800 px."""
+    camera, info = Camera("fisheye", FULL, (150.0, 150.0), (319.5, 239.5)), camera_info("plumb_bob", None, (1, 1))
+    info.d, info.k = np.zeros(5), np.array([150.0, 0, 319.5, 0, 150.0, 239.5, 0, 0, 1.0])
+    u, v = np.meshgrid(np.linspace(0, 639, SAMPLES), np.linspace(0, 479, SAMPLES))
+    angle = np.hypot(u - 319.5, v - 239.5) / 150
+    apart = np.where(angle < np.pi / 2, 150 * (np.tan(angle) - angle), 800.0).clip(max=800.0)
+    assert 0.1 < (angle > np.pi / 2).mean() < 0.5
+    said = f"{np.sqrt((apart**2).mean()):.1f} px off (rms over the image, at most 800.0)"
+    assert said in camera_mismatch(info, camera)
 
 
 @pytest.mark.parametrize("topic", ["/finger/image_raw", "/finger/image_raw/compressed", "/finger/image", "/finger/image_mono"])

@@ -136,6 +136,16 @@ def test_a_sheet_has_every_frame_with_its_name_force_and_status(folder):
     assert len({axes.get_position().bounds for axes in drawing.axes}) == 5
 
 
+@pytest.mark.parametrize("hardest, said", [(0.01234, "0.0123"), (1.234, "1.23"), (123.4, "123"), (12340.0, "12340")])
+def test_forces_on_a_sheet_have_three_digits_of_the_hardest(folder, hardest, said):
+    results = read_results(folder)
+    frame = results["i3"] | {"force": np.array([0.0, 0.0, -hardest])}
+    light = results["i2"] | {"force": np.array([0.0, 0.0, -hardest / 10])}
+    drawing = sheet_figure({"light": (light, None), "hard": (frame, None)}, results.mesh)
+    one, other = (axes.get_title().partition("\n")[2] for axes in drawing.axes[:2])
+    assert other == f"{said} N" and len(one.partition(".")[2]) == len(other.partition(".")[2])
+
+
 def test_frames_of_a_long_recording_are_chosen_evenly():
     assert evenly(range(1001), 101) == list(range(0, 1001, 10)) and evenly([1], 5) == [1]
 

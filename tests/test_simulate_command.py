@@ -201,6 +201,28 @@ def test_a_data_set_carries_the_sensor_s_record(sensor_path, tmp_path, capsys, f
         assert pyarrow.parquet.read_schema(part).metadata[b"record"].decode() == recorded.record.text
 
 
+def test_targets_of_random_presses_are_uniform_in_area_off_the_rim_and_in_view(sensor_path):
+    """By the probabilities of the vertices that are drawn."""
+    simulator, rng, given = Simulator(Sensor.from_file(sensor_path)), np.random.default_rng(0), []
+
+    class Drawing:
+        def __getattr__(self, name):
+            return getattr(rng, name)
+
+        def choice(self, count, p):
+            given.append(p)
+            return rng.choice(count, p=p)
+
+    membrane = simulator.membrane
+    seen = membrane.rest[:, 0].numpy() > 0
+    for view in (None, seen):
+        dataset.random_stroke(simulator, dataset.Plan(("sphere",)), Drawing(), view)
+    off_rim = torch.cdist(membrane.rest, membrane.rest[membrane.fixed]).amin(1).numpy() > dataset.OFF_RIM * membrane.size
+    for p, where in zip(given, (off_rim, off_rim & seen), strict=True):
+        area = np.where(where, membrane.rest_area.numpy(), 0.0)
+        np.testing.assert_allclose(p, area / area.sum())
+
+
 def test_presses_that_fail_are_reported_and_give_1(sensor_path, tmp_path, capsys, monkeypatch):
     draw, seen = dataset.random_stroke, []
 
@@ -249,6 +271,7 @@ def test_a_folder_of_another_look_or_sensor_is_refused(sensor_path, tmp_path, ca
         (("--indenter", "sphere", "--radius", "1e300", "--depth", "1"), "--radius 1e+300: no press"),
         (("--indenter", "sphere", "--radius", "3", "--depth", "1e300"), "--depth 1e+300: no press"),
         ((*SPHERE, "--increment", "1e-9"), "--increment 1e-09: no press"),
+        (("--indenter", "box", "--sides", "4,4,1e6", "--radius", "0.5", "--depth", "1"), "--sides 4,4,1e+06: no press"),
         ((*SPHERE, "--dots", "5,9"), "--dots, radii of small and large dots: dots 0 and"),
         ((*SPHERE, "--name", "sensor_rest"), "--name sensor_rest"),
         (("--indenter", "/etc/passwd", "--depth", "1"), "/etc/passwd: its name is not that of a mesh; expected a closed mesh"),

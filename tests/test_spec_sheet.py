@@ -4,6 +4,7 @@ import math
 import pickle
 from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from PIL import Image
 from torchmembrane.accuracy import measure, presses, rig, statistics
 from torchmembrane.accuracy.finished import FinishedSeries
 from torchmembrane.accuracy.measure import spec_sheet
-from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, Effort, PairTrial, PressTrial, Spread
+from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, Effort, Outcome, PairTrial, PressTrial, Spread
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.cli.sheet import sheet_lines
@@ -22,6 +23,7 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.plot.accuracy import draw_sheet
 from torchmembrane.results.reconstruction import Reconstruction
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.sensor.working_range import WorkingRange
 from torchmembrane.simulate import dataset
 
 LITTLE = Effort(strokes=2, frames=3, directions=1, distances=2, rest=3)
@@ -207,6 +209,7 @@ def test_presses_are_drawn_with_their_errors_in_percent(sheet):
     figure = Figure()
     draw_sheet(figure, sheet._replace(presses=[trial(1.0, depth=0.5, surface_error=0.1), bad]))
     points = {line.get_label(): line.get_xydata().tolist() for line in figure.axes[2].lines}
+    np.testing.assert_allclose(figure.axes[0].lines[0].get_xydata(), [[1, 2], [2, 2]])  # of force errors of 0.02
     assert points["reconstructed"] == [[0.5, pytest.approx(10)]] and points["not"] == [[0.7, pytest.approx(40)]]
 
 
@@ -344,6 +347,17 @@ def test_another_seed_gives_another_sheet(sensor, sheet):
     assert other.rest != sheet.rest and not {t.force for t in other.presses} & {t.force for t in sheet.presses}
 
 
+@pytest.mark.parametrize("count, share", [(25, 0.2), (100, 0.1), (2500, 0.05)])
+def test_a_contact_counts_as_found_within_the_markers_spacing_and_within_a_twentieth_of_the_size(
+    sensor, monkeypatch, count, share
+):
+    markers, simulator = SimpleNamespace(rest_markers=np.zeros((count, 3))), SimpleNamespace(grid=(22, 22))
+    monkeypatch.setattr(measure, "Rig", lambda *_: SimpleNamespace(simulator=simulator, reconstructor=markers))
+    monkeypatch.setattr(measure, "_outcomes", lambda *_: [Outcome()])
+    sheet, size = spec_sheet(sensor, noise=40.0, effort=Effort(0, 0, 0, 0, 0)), sensor.membrane.size
+    assert sheet.near == pytest.approx(share * size) and sheet.spacing == pytest.approx(size / count**0.5)
+
+
 def test_a_sheet_is_what_its_trials_give(sheet, sensor):
     assert 3 < len(sheet.presses) <= 6 and len(sheet.pairs) == 2 and sheet.rest.frames == 3
     assert sheet.near == sheet.spacing == pytest.approx(sensor.membrane.size / 7)
@@ -414,12 +428,15 @@ def test_the_sheet_s_lines_hold_its_figures(sheet):
         bands=[band._replace(depth=Spread(0.1, 0.2), place=Spread(math.nan, math.nan))],
         closest=ClosestPair(3, 2, Spread(4.0, 5.0), 1.0, 9.0),
         force_unit="relative",
+        range=WorkingRange(0.25, 60.0, 12.5, "of this sensor"),
     )
     lines = "\n".join(sheet_lines(told))
     cells = "0 to 1.2", "7", "50 %", "25 %", "1.2 % / 34 %", "0.1 / 0.2", "- / -"
     assert "  ".join(f"{c:>{w}}" for c, w in zip(cells, (20, 7, 9, 5, 13, 15, 15), strict=True)) in lines
     assert "distance of 4 / 5 mm on" in lines and "2 of 3 directions; tried from 9 down to 1 mm" in lines
     assert "force, relative" in lines and "N/mm" not in lines
+    assert "right up to 0.25 of the size deep and 12.5 relative" in lines
+    assert "range     none: presses are wrong" in "\n".join(sheet_lines(told._replace(range=None)))
 
 
 @pytest.mark.parametrize("work", [measure, dataset])

@@ -139,6 +139,22 @@ def test_rows_of_a_table_without_the_last_columns_are_kept(table, tmp_path):
     assert {row[name] for name in AFTER} == {""}
 
 
+DAMAGE = {
+    "a cell less": lambda cells: cells[:-1],
+    "a cell more": lambda cells: [*cells, "7"],
+    "cut off": lambda cells: cells[:9],
+    "a word for a number": lambda cells: ["much" if name == "force" else cell for name, cell in zip(NAMES, cells, strict=True)],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_row_is_left_out_and_the_others_are_kept(table, damage, tmp_path):
+    rows = [[table[0][name] for name in NAMES], [table[2][name] for name in NAMES]]
+    with open(tmp_path / "summary.csv", "w", newline="") as file:
+        csv.writer(file).writerows([NAMES, rows[0], DAMAGE[damage](rows[0]), rows[1]])
+    assert [[row[name] for name in NAMES] for row in read_summary(tmp_path)] == rows
+
+
 def test_relative_pressures_are_not_given_in_hectopascals():
     frame = {"pressure": np.float32(2.0), "pressure_change": np.float32(1.0)}
     normals = np.zeros((0, 3))

@@ -12,6 +12,7 @@ from test_batch import HEIGHT, WIDTH, Denting, reconstruct, summary_of
 from torchmembrane.errors import MembraneError
 from torchmembrane.files.images import to_grey
 from torchmembrane.files.video import picture_total, picture_values, video_pictures
+from torchmembrane.files.video_end import missing_end
 from torchmembrane.live.sources import video_images
 from torchmembrane.plot.film import write_film
 from torchmembrane.results.read import read_results
@@ -103,6 +104,18 @@ def test_a_recording_that_was_not_closed_says_so(tmp_path):
     assert f"not readable as a video (Invalid data found when processing input; 3000 of at least {at} bytes)" in read(path)[1]
     path.write_bytes(whole[:at])
     assert "no index (moov), as where a recording was not closed" in read(path)[1]
+
+
+def test_parts_of_an_avi_begin_at_even_places(tmp_path):
+    """A part of 13 bytes, the byte that makes it even, and a part of 12 bytes: whole, and cut off anywhere in the second."""
+    first = b"RIFF" + struct.pack("<I", 13) + b"AVI " + bytes(9)
+    second = b"RIFF" + struct.pack("<I", 12) + b"AVIX" + bytes(8)
+    path, whole = tmp_path / "film.avi", first + bytes(1) + second
+    path.write_bytes(whole)
+    assert missing_end(path) == ""
+    for lost in (1, 12):
+        path.write_bytes(whole[:-lost])
+        assert missing_end(path) == f"{42 - lost} of at least 42 bytes"
 
 
 def test_an_early_end_is_a_failed_frame_and_the_batch_goes_on(tmp_path):

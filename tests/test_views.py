@@ -9,17 +9,19 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.calibrate.material import material_from_pixels
-from torchmembrane.camera.rig import Rig
+from torchmembrane.camera.rig import Rig, turns_by_noise
 from torchmembrane.cli.describe import described, rest_frame
 from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
 from torchmembrane.jobs.inputs import Inputs, of_first_view
 from torchmembrane.plot.sensor import sensor_figure
 from torchmembrane.pose import ViewPose
+from torchmembrane.results.status import Status
 from torchmembrane.results.store import Mesh, Settings
 from torchmembrane.results.view_status import status_in_words
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.sensor.view_images import first_view_image, first_view_picture
 from torchmembrane.sensor.views import View
 from torchmembrane.simulate import Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
@@ -168,6 +170,28 @@ def test_rays_of_a_rig_pass_through_the_points_whose_pixels_they_are():
     torch.testing.assert_close(direction.norm(dim=-1), torch.ones(4, 21).double())
 
 
+def test_one_view_that_has_moved_too_far_is_enough():
+    rig = Rig([CAMERA, CAMERA], [ViewPose(np.eye(3), np.zeros(3)), BESIDE])
+    far = torch.zeros(4, 2, 4)
+    far[1, 0, 0], far[2, 1, 1], far[3, :, 0] = 50.0, -50.0, 50.0
+    assert rig.is_displaced(far.flatten(1)).tolist() == [False, True, True, True]
+
+
+@pytest.mark.parametrize("ports", [(), ((0.5, 4.0, 1.49), (6.0, 1.0, 1.6))])
+def test_rays_turn_by_the_noise_of_pixels_about_points_on_them(ports):
+    """By how far a ray to a neighbouring pixel misses the point, over its distance; behind a port rays shift as well."""
+    camera = tm.Camera("pinhole", (160, 120), (100, 100), (79.5, 59.5), ports=list(ports), medium_index=1.33 if ports else 1.0)
+    points = torch.rand(1, 9, 3, dtype=torch.float64) * torch.tensor([10, 8, 4]) + torch.tensor([-5, -4, 9])
+    pixels, step = camera.point_to_pixel(points), 1e-4
+    turned = turns_by_noise(camera, pixels, points, 0.04 * torch.eye(2).double().expand(9, 2, 2))
+    distance = (points - camera.pixel_to_ray(pixels).origin).norm(dim=-1)[..., None]
+    for k in range(2):
+        origin, direction = camera.pixel_to_ray(pixels + step * torch.eye(2).double()[k])
+        miss = origin - points + ((points - origin) * direction).sum(-1, keepdim=True) * direction
+        across = turned[:, :, k] - (turned[:, :, k] * direction).sum(-1, keepdim=True) * direction
+        torch.testing.assert_close(across, 0.2 / step * miss / distance, rtol=1e-3, atol=1e-6)
+
+
 def test_two_views_see_what_one_infers(found, alone, press):
     """Both views' markers are found and explained; the surface is nearer to the truth than that of the first view alone."""
     simulator, images, truth, state = press
@@ -202,6 +226,39 @@ def test_the_order_of_the_views_does_not_matter(press, found):
     back = BESIDE.points(got.vertices[0])
     assert float((back - found.vertices[0]).norm(dim=-1).max()) < 0.02 * 1.2
     np.testing.assert_allclose(BESIDE.vectors(got.force[0]).numpy(), found.force[0].numpy(), atol=0.03 * found.force.norm())
+
+
+def test_the_first_view_of_a_picture_is_its_region_wherever_that_lies():
+    whole = tm.Camera("pinhole", (400, 300), (200, 200), (199.5, 149.5))
+    views = [View(name, whole.in_mode((left, 130, 160, 120)), is_region=True) for name, left in (("a", 210), ("b", 20))]
+    grey = np.arange(300 * 400).reshape(300, 400) % 251
+    expected = grey[130:250, 210:370]
+    np.testing.assert_array_equal(first_view_picture(grey, views), expected)
+    np.testing.assert_array_equal(first_view_picture(np.stack([grey] * 3, -1), views)[..., 1], expected)
+    np.testing.assert_array_equal(first_view_image(torch.from_numpy(grey)[None, None], views), expected)
+    apart = [View("a", CAMERA), View("b", CAMERA)]
+    assert first_view_picture([grey, None], apart) is grey and first_view_picture([None, grey], apart) is None
+    assert first_view_picture(grey, ()).shape == first_view_image(torch.from_numpy(grey)[None, None], ()).shape == (300, 400)
+
+
+def test_a_camera_given_to_a_region_is_that_of_the_region_s_pixels():
+    whole = tm.Camera("pinhole", (640, 480), (400, 410), (320, 240))
+    view = View("right", whole.in_mode((320, 96, 320, 300)), is_region=True)
+    lens = tm.Camera("pinhole", (320, 300), (405, 402), (3.5, 147.0), (-0.1, 0.02, 0.001, -0.002))
+    found, points = view.with_camera(lens), torch.tensor([[1.0, 2.0, 20.0], [4.0, -3.0, 25.0]], dtype=torch.float64)
+    assert found.region == view.region and found.camera.mode.image_size == (640, 480)
+    torch.testing.assert_close(found.camera.point_to_pixel(points), lens.point_to_pixel(points))
+
+
+def test_where_all_views_fail_the_frame_has_the_gravest_of_their_reasons(reconstructor):
+    """Values that are none before blank images, these before too few markers, and these before another scene."""
+    gravest = [Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UNLIKE_REST]
+    pairs = torch.tensor([[int(one), int(other)] for one in gravest for other in gravest])
+    flow = reconstructor.observer.from_pixels(reconstructor.rest_pixels[None], None, None)
+    many = [value.expand(len(pairs), *value.shape[1:]) for value in flow[:3]]
+    found = reconstructor.observer.judge(*many, pairs)
+    expected = [gravest[min(i, j)] for i in range(4) for j in range(4)]
+    assert found.status.tolist() == expected and (found.confidence == 0).all()
 
 
 def test_a_view_that_fails_is_left_out_and_named(reconstructor, alone, press):

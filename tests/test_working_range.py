@@ -114,7 +114,8 @@ def test_a_sensor_file_s_range_is_taken_while_it_is_of_that_sensor(sensor, tmp_p
     read = tm.Sensor.from_file(path)
     assert read.range == own and read.fingerprint == sensor.fingerprint
     assert read.range.for_fingerprint(read.fingerprint) == own and read.range.for_fingerprint("of another sensor") == GENERAL
-    assert any("12.5 N, as `check --accuracy` has shown" in line for line in described(read))
+    deep = f"up to {0.25 * sensor.membrane.size:.3g} mm deep, the surface turned by 70 degrees"
+    assert any(f"{deep}, 12.5 N, as `check --accuracy` has shown" in line for line in described(read))
     assert any("of another state of this file" in line for line in described(replace(read, name="other")))
     range_file(path).write_text(range_file(path).read_text() + "width = 3\n")
     with pytest.raises(tm.MembraneError, match="sensor_range.toml.*width"):

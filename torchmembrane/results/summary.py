@@ -107,8 +107,10 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def _is_whole(row: dict[str, Any]) -> bool:
-    """Return whether a row has all its cells, with numbers where they are required."""
+    """Return whether a row has all its cells and no more, with numbers where they are required."""
+    if None in row or None in row.values():  # more cells than the header, or fewer
+        return False
     try:
-        return None not in row.values() and all(key in TEXT or not text or float(text) is not None for key, text in row.items())
+        return all(key in TEXT or not text or float(text) is not None for key, text in row.items())
     except ValueError:
         return False
