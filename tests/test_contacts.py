@@ -14,6 +14,7 @@ from torchmembrane.markers.coverage import Coverage, facings
 from torchmembrane.presets import preset
 from torchmembrane.results.npz import ADDED, completed
 from torchmembrane.results.reconstruction import Reconstruction
+from torchmembrane.sensor.parts import FRICTION
 from torchmembrane.sensor.working_range import UNLIMITED
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
@@ -21,7 +22,7 @@ from torchmembrane.surface.shapes import spherical_cap
 
 DOME = spherical_cap(12, 9, 3, (33, 33))
 PATCHES = ContactPatches(DOME)
-SURROUNDINGS = TractionLoss(DOME, 1.0, ForceBalanceSettings()).surroundings
+SURROUNDINGS = TractionLoss(DOME, 1.0, ForceBalanceSettings(), FRICTION).surroundings
 
 
 def pressed_by(x, centres, radius=3.0, size=0.02, shear=0.0):
@@ -282,7 +283,7 @@ def test_markers_that_the_press_turns_away_are_not_hidden(fingertip, monkeypatch
     seen = torch.ones(1, len(reconstructor.rest_markers))
     observation = reconstructor.observation(torch.zeros(1, seen.shape[1], 2), seen)
     found = net.equilibrium(u, pressure, moved, u, net.equations.bearings.measured(observation))
-    none = {name: 0 * pressure for name in ("misfit", "unexplained", "shared_misfit", "pushed")}  # it is no equilibrium
+    none = {name: 0 * pressure for name in ("misfit", "unexplained", "shared_misfit")}  # it is no equilibrium
     found = found._replace(volume=net.membrane.rest_volume[None], **none)
     markers = reconstructor.rest_markers + reconstructor.marker_shares @ u
     moved_by = reconstructor.camera.point_to_pixel(markers) - reconstructor.rest_pixels

@@ -20,6 +20,7 @@ from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.traction_loss import TractionLoss
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor.parts import FRICTION
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.solve import block_pentadiagonal
@@ -222,10 +223,10 @@ def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
 
 
 def test_a_push_lowers_the_price_of_shear(pressed):
-    """Without the cone shear is as expensive under a push as elsewhere, and another surface is found."""
+    """Without friction shear is as expensive under a push as elsewhere, and another surface is found."""
     (origins, directions), *_ = pressed
     steep, usual = make(13), make(13)
-    steep.equations.loss.settings = replace(SETTINGS, cone=0.0)
+    steep.equations.loss.friction = 0.0
     found = []
     for one in (steep, usual):
         measured = one.equations.bearings.measured(seen(origins, directions))
@@ -391,7 +392,8 @@ def test_shear_weighs_much_but_where_something_pushes():
     large, _ = patch_of_pushes(estimator, 1e-6, shear=0.5)
     small, _ = patch_of_pushes(estimator, 4.0, shear=0.5)
     large, small = (weights(estimator, force)[1][centre] for force in (large, small))
-    assert 0.9 * SETTINGS.friction / 0.5 < large < SETTINGS.friction / 0.5 and small < large / (0.9 * SETTINGS.cone * 4)
+    full, cone = SETTINGS.shear / 0.5, estimator.equations.loss.cone
+    assert 0.9 * full < large < full and small < large / (0.9 * cone * 4)
 
 
 def test_a_lone_push_is_taken_for_error_its_patch_for_a_contact():
@@ -533,7 +535,7 @@ def test_the_example_images_give_shape_force_and_place():
 def test_the_loss_of_normal_tractions_has_the_derivative_that_the_weights_say():
     estimator = make()
     membrane, p0 = estimator.membrane, estimator.reference
-    loss = TractionLoss(membrane, p0, replace(SETTINGS, floor=0.0))
+    loss = TractionLoss(membrane, p0, replace(SETTINGS, floor=0.0), FRICTION)
     loss.push_noise = torch.full_like(loss.area, 1e6)  # tractions over p0
     loss.surroundings = torch.eye(len(loss.area), dtype=torch.float64)
     normal = inner(membrane.rest_normals, membrane.grid).mT[None]

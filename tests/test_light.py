@@ -12,7 +12,6 @@ from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance import traction_loss
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
-from torchmembrane.estimators.force_balance.traction_loss import is_significant
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
@@ -93,7 +92,7 @@ def test_nothing_is_a_push_that_the_noise_makes_by_itself():
 @pytest.mark.parametrize("options", [{}, dict(filling="open"), dict(filling="gas", gas=(0.1, 2600.0))])
 def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     """One undamped quadratic step from rest for a small error of every marker in either direction; their squares add up."""
-    estimator, small = make(13, settings=replace(SETTINGS, damping=0.0), **options), 1e-4
+    estimator, small = make(13, **options), 1e-4
     bearings, loss = estimator.equations.bearings, estimator.equations.loss
     true = torch.nn.functional.normalize(bearings.positions, dim=-1)
     unit = bearings.measured(seen(torch.zeros_like(true), true)).across[0].movedim(-1, 0) * bearings.noise  # [D, 2, 3]
@@ -110,9 +109,6 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small
     expected = (push.square().sum(0) @ loss.surroundings).sqrt()
     torch.testing.assert_close(loss.push_noise, expected, rtol=0.01, atol=0)
-    before, after = (bearings.angles(y, measured, m)[0] for y, m in ((0 * u[:1], 0 * moved), (u, moved)))
-    gained = (before * (before - after)).sum() / 2 / small**2 / D  # of a quadratic: half of what the residuals lose
-    torch.testing.assert_close(loss.noise_gain, gained, rtol=0.01, atol=0)
 
 
 def test_a_push_is_a_contact_where_it_stands_out_of_the_noise():
@@ -124,29 +120,9 @@ def test_a_push_is_a_contact_where_it_stands_out_of_the_noise():
     middle[len(patch) // 2] = True
     for times, is_contact in ((1.5, False), (6.0, True)):
         traction = times * loss.push_noise[middle] * force / loss.area
-        scale = loss.contact_scale(loss(traction, normal.mT, ONE), ONE, 1e3 * ONE)[0, middle]
+        scale = loss.contact_scale(loss(traction, normal.mT, ONE), ONE)[0, middle]
         pushed = -(traction[0] * normal.mT).sum(0)[middle] / estimator.reference
         assert (pushed > scale / 2).item() is is_contact
-
-
-def test_pushes_are_no_contact_where_the_surface_at_rest_explains_the_markers_as_well(pressed):
-    """One and the same surface with a push: of markers as they are seen on it, and of markers at rest."""
-    estimator = make(17)
-    membrane, bearings, loss = estimator.membrane, estimator.equations.bearings, estimator.equations.loss
-    rest = torch.nn.functional.normalize(bearings.positions, dim=-1)
-    directions = torch.stack([pressed[0][1], rest])
-    markers = seen(torch.zeros_like(directions), directions)
-    x, pressure = (value[:1].expand(2, *value.shape[1:]) for value in estimator(markers)[:2])
-    measured, u = bearings.measured(markers), x - membrane.rest
-    found = estimator.equilibrium(u, pressure, torch.zeros(2, 4).double(), u, measured)
-    gain = estimator.gauss_newton.objective_at_rest(measured) / measured.weight.sum(-1) - found.objective
-    assert gain[0] > SETTINGS.evidence * loss.noise_gain > gain[1]
-    is_contact = is_significant(found.reference / estimator.reference) & ~membrane.fixed
-    assert is_contact[0].any() and not is_contact[1].any()
-    at_rest_found = estimator.equilibrium(*estimator.at_rest(measured.weight), u, measured)
-    torch.testing.assert_close(
-        estimator.gauss_newton.objective_at_rest(measured), at_rest_found.objective * measured.weight.sum(-1)
-    )
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)

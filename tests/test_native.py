@@ -105,11 +105,11 @@ def set_settings(balance, **changes):
     return settings
 
 
-@pytest.mark.parametrize("tau, damping, cone", [(4.0, 3e-5, 5.0), (16.0, 1e-7, 0.0), (0.4, 1e-3, 23.0)])
+@pytest.mark.parametrize("tau, friction", [(4.0, 0.1), (16.0, 0.0), (0.4, 0.5)])
 @pytest.mark.parametrize("grid", [(9, 9), (6, 13), (17, 17)])
-def test_so_it_is_with_all_scales_on_all_grids(tau, damping, cone, grid):
+def test_so_it_is_with_all_scales_on_all_grids(tau, friction, grid):
     balance = estimator(grid=grid)
-    set_settings(balance, damping=damping, cone=cone)
+    balance.equations.loss.friction = friction
     given = problem(balance)
     assert_same(taken(balance, *given, tau), expected(balance, *given, tau))
 
@@ -163,9 +163,9 @@ def test_a_schedule_is_that_of_tensor_operations(steps, tol, settle):
 
 
 def test_the_likeliest_of_the_last_states_is_that_of_tensor_operations():
-    """Of hardly damped steps that never settle: the lowest objective is that of the last one in the first frame alone."""
-    balance, last = estimator(prestretch=1.03), []
-    set_settings(balance, settled_step_tol=0.0, settling_damping=1e-6)
+    """Of steps that never settle: the lowest objective is that of the last one in the first frame alone."""
+    balance, last = estimator(prestretch=1.1), []
+    set_settings(balance, settled_step_tol=0.0)
     state, measured = problem(balance)
     state = State(0.1 * state.u, *state[1:])
     step = balance.gauss_newton.step
@@ -178,9 +178,8 @@ def test_the_likeliest_of_the_last_states_is_that_of_tensor_operations():
 
 def test_every_setting_is_heard_of():
     """Each changes a step, as it changes that of tensor operations."""
-    changed = dict(friction=2.0, slip=0.2, sparsity=900.0, floor=0.1, scale_share=0.9, far_share=0.8, noise_share=40.0)
-    changed |= dict(camera_motion=0.5, largest_stretch=1e-3)
-    changed |= dict(cone=1.0, outlier=9.0, damping=0.1)
+    changed = dict(shear=2.0, slip=0.2, sparsity=900.0, floor=0.1, scale_share=0.9, far_share=0.8, noise_share=40.0)
+    changed |= dict(camera_motion=0.5, largest_stretch=1e-3, outlier=9.0)
     balance = estimator()
     given = problem(balance)
     usual = taken(balance, *given, 0.5)[0]

@@ -253,7 +253,7 @@ def test_rezero_nulls_what_has_drifted_since_the_rest_image(sensor):
 
 
 def test_names_before_this_version_are_accepted():
-    old, new = dict(settled_step=1e-6, misfit_of_press=3.0), dict(settled_step_tol=1e-6, misfit_per_displacement=3.0)
+    old, new = dict(settled_step=1e-6, unexplained_of_press=3.0), dict(settled_step_tol=1e-6, unexplained_per_displacement=3.0)
     assert tm.ForceBalanceSettings(**old) == tm.ForceBalanceSettings(**new) != tm.ForceBalanceSettings()
     assert replace(tm.ForceBalanceSettings(**new), settled_step=1e-5).settled_step_tol == 1e-5
     assert set(OLD_NAMES.values()) < {field.name for field in fields(tm.ForceBalanceSettings)}

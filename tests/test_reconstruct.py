@@ -19,7 +19,7 @@ from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.results import npz as results
 from torchmembrane.results.status import Status
-from torchmembrane.sensor.parts import Cavity
+from torchmembrane.sensor.parts import FRICTION, Cavity
 from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -220,6 +220,18 @@ def test_a_gas_without_modulus_is_a_liquid_and_says_so_once(sensor, result, imag
         warnings.simplefilter("error")
         got = reconstructor(images)
     torch.testing.assert_close(got.vertices, result.vertices, rtol=0, atol=1e-4)
+
+
+def test_the_friction_of_the_material_is_that_of_the_force_balance(sensor, images):
+    """With more friction, more shear is accepted under a push."""
+    found = []
+    for friction in (FRICTION, 4 * FRICTION):
+        made = Reconstructor(dataclasses.replace(sensor, material=dataclasses.replace(sensor.material, friction=friction)))
+        assert made.estimator.equations.loss.friction == friction
+        found.append(made(images))
+    shear = [(result.traction - (result.traction * result.normals).sum(-1, keepdim=True) * result.normals) for result in found]
+    less, more = (torch.linalg.vector_norm(field, dim=-1).sum() for field in shear)
+    assert more > less
 
 
 def test_gas_pressure_is_in_the_sensors_units(sensor):

@@ -11,12 +11,13 @@ import pytest
 import torch
 from PIL import Image
 
+from torchmembrane.cli.describe import described
 from torchmembrane.errors import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.factories import cavity_filling, elastic_energy
 from torchmembrane.sensor.marker_checks import LEAST_APART, OFF_SURFACE, refuse_coincident, refuse_off_surface
-from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.parts import FRICTION, Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
 
@@ -156,6 +157,16 @@ def test_without_modulus_or_thickness_forces_are_relative(tmp_path, missing):
     assert sensor.force_unit == "relative" and sensor.material.modulus == 1.0
 
 
+def test_friction_is_read_and_written_and_0_5_where_it_is_left_out(tmp_path):
+    usual = Sensor.from_file(write(tmp_path / "a"))
+    slippery = Sensor.from_file(write(tmp_path / "b", replaced("thickness = 0.5", "thickness = 0.5\nfriction = 0.0")))
+    assert usual.material.friction == FRICTION == 0.5 and slippery.material.friction == 0.0
+    assert "friction" not in usual.to_file(tmp_path / "c").read_text()
+    assert Sensor.from_file(slippery.to_file(tmp_path / "d")).material.friction == 0.0
+    lines = "\n".join([*described(usual), *described(slippery)])
+    assert "friction 0.5 with what touches it, the default" in lines and "friction 0 with what touches it\n" in lines
+
+
 @pytest.mark.parametrize("shape", MEMBRANES)
 def test_what_is_written_is_read_back(tmp_path, shape):
     sensor = Sensor.from_file(write(tmp_path / "a", with_membrane(shape)))
@@ -219,6 +230,7 @@ def test_fingerprint_is_of_the_content_not_of_its_place_or_order(tmp_path):
         ("c2_ratio = 0.1", "c2_ratio = 0.2"),
         ("shear_modulus = 0.3\n", ""),
         ("thickness = 0.5", "thickness = 0.6"),
+        ("thickness = 0.5", "thickness = 0.5\nfriction = 0.8"),
         ("pressure = 1013.0", "pressure = 1014.0"),
         ("pressure = 1013.0", "pressure = 1013.0\nvolume = 9.0"),
         ('"gas"', '"liquid"'),
@@ -348,6 +360,12 @@ BAD_TEXTS = [
     (replaced("c2_ratio = 0.1\n", ""), "[material]", "c2_ratio is None; expected C2 / C1", "add it"),
     (replaced('"mooney_rivlin"', '"ogden"'), "[material]", "'ogden'; expected one of harmonic, neo_hookean"),
     (replaced("thickness = 0.5", "thickness = 0.0"), "[material]", "thickness is 0.0; expected a finite positive"),
+    (
+        replaced("thickness = 0.5", "friction = -0.1"),
+        "[material]",
+        "friction is -0.1; expected Coulomb's",
+        "0 (no friction) to 10",
+    ),
     (replaced("pressure = 1013.0\n", ""), "[cavity]", "pressure is None; expected", "hPa"),
     (replaced("pressure = 1013.0", "pressure = -1.0"), "[cavity]", "pressure is -1.0; expected a finite positive"),
     (replaced('"gas"', '"steam"'), "[cavity]", "filling is 'steam'; expected 'liquid'"),

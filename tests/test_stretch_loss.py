@@ -78,6 +78,6 @@ def test_a_solve_that_ended_elsewhere_is_led_to_what_its_neighbours_found(light)
     stuck = estimator.equilibrium(*at_rest, at_rest.u, measured)
     assert (stuck.objective > 2 * found.objective).all()
     led = continued([best[3], (estimator, stuck), best[5]], observation)[1][1]
-    assert led.objective.numpy() == pytest.approx(found.objective.numpy(), rel=0.1)
+    assert (led.objective <= 1.1 * found.objective).all()  # a better one may be found on the way
     for (_, before), (_, after) in zip(solutions, best, strict=True):
         assert (after.objective <= before.objective).all()

@@ -99,7 +99,7 @@ class Reconstructor(nn.Module):
         self.observer, self.camera, self.marker_points = seen.observer, seen.camera, seen.markers.points
         positions, levers = torch.from_numpy(seen.markers.positions), seen.markers.levers
         self.levers = None if levers is None else Levers(membrane, self.marker_points, torch.from_numpy(levers))
-        problem = problem_of(seen, membrane, elastic_energy(sensor, membrane, model), cavity)
+        problem = problem_of(seen, membrane, elastic_energy(sensor, membrane, model), cavity, sensor.material.friction)
         self.register_buffer("vertex_pixels", seen.vertex_pixels)
         self.register_buffer("rest_markers", positions)
         shares = bicubic_shares(self.marker_points, membrane.grid, membrane.fixed)

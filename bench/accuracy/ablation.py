@@ -21,6 +21,7 @@ import torchmembrane as tm
 from bench.accuracy.accuracy import cases_in, contact_errors
 from bench.data.record import write
 from torchmembrane.markers.observer import FOUND_CONFIDENCE
+from torchmembrane.sensor.parts import FRICTION
 
 GRID = 33
 BASE = tm.ForceBalanceSettings()
@@ -34,6 +35,7 @@ class Variant:
     label: str
     settings: tm.ForceBalanceSettings = BASE
     model: str | None = None
+    friction: float = FRICTION
     filling: Callable[[tm.Cavity], tm.Cavity] = lambda cavity: cavity
     grid: int = GRID
     assumed: float = 1.0  # of the noise that markers are known to have
@@ -57,22 +59,18 @@ VARIANTS = [
     *(Variant("base", f"{n} x {n}, exact markers", grid=n, exact=True) for n in (33, 17)),
     Variant("cavity", "open: no volume constraint", filling=lambda cavity: replace(cavity, filling="open")),
     Variant("cavity", "gas, 1013 hPa", filling=lambda cavity: replace(cavity, filling="gas", pressure=1013.0)),
-    changed("compressive loss", "quadratic: tau = (10, 10), fine_tau = 10", tau=(10.0, 10.0), fine_tau=10.0),
-    changed("compressive loss", "not graduated: tau = (0.4, 0.4), fine_tau = 0.4", tau=(0.4, 0.4), fine_tau=0.4),
+    changed("compressive loss", "quadratic: tau = (10, 10)", tau=(10.0, 10.0)),
+    changed("compressive loss", "not graduated: tau = (0.4, 0.4)", tau=(0.4, 0.4)),
     *each("compressive loss", "sparsity", BASE.sparsity / 4, BASE.sparsity * 4),
     *each("what tractions are measured against", "scale_share", 0.1, 0.4),
     *each("what tractions are measured against", "far_share", 0.0, 0.2),
-    *each("what tractions are measured against", "scale_reach", 0.04, 0.16),
     *each("largest stretch in a step", "largest_stretch", 0.15, 0.6),
-    *each("friction", "friction", 0.0, BASE.friction / 4, BASE.friction * 4),
-    *each("friction", "cone", 0.0, 40.0),
-    *each("friction", "coarse_cone", 0.0, 23.0),
+    *each("shear and friction", "shear", 0.0, BASE.shear / 4, BASE.shear * 4),
+    *(Variant("shear and friction", f"friction = {mu:g}", friction=mu) for mu in (0.0, 0.25, 1.0)),
     *(Variant("energy", model.replace("_", "-"), model=model) for model in ("harmonic", "neo_hookean", "mooney_rivlin")),
     *(Variant("grid", f"{n} x {n}", grid=n) for n in (13, 25)),
-    *each("steps", "fine_tau", 0.4, 2.0),
     *each("steps", "settled_step_tol", 1e-4, 1e-5),
     *(changed("steps", f"steps = (64, 32, {n})", steps=(64, 32, n)) for n in (4, 8, 32, 64)),
-    changed("steps", "17 x 17 from rest: coarsest = 17", grid=17, coarsest=17),
     *each("surroundings", "reach", 1e-6, 0.08),
     *each("surroundings", "floor", 0.0, 1e-2),
     *(Variant("marker noise", f"assumed {share:g} times as large", assumed=share) for share in (0.5, 2)),
@@ -84,7 +82,8 @@ VARIANTS = [
 def reconstructor_of(sensor: tm.Sensor, variant: Variant) -> tm.Reconstructor:
     markers = replace(sensor.markers, rest_image=None)
     membrane, cavity = sensor.surface.membrane((variant.grid, variant.grid)), variant.filling(sensor.cavity)
-    sensor = replace(sensor, membrane=membrane, cavity=cavity, markers=markers)
+    material = replace(sensor.material, friction=variant.friction)
+    sensor = replace(sensor, membrane=membrane, material=material, cavity=cavity, markers=markers)
     return tm.Reconstructor(sensor, settings=variant.settings, model=variant.model)
 
 

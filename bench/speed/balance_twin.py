@@ -48,7 +48,7 @@ class BalanceTwin:
             displacement, pressure = self.coarse(observation)
             still = torch.zeros(1, 4).double()
             u, pressure, _ = e.refined(torch.from_numpy(displacement)[None], torch.tensor([pressure]).double(), still)
-        tau, last = (e.settings.tau[0] if self.coarse is None else e.settings.fine_tau), e.settings.tau[1]
+        tau, last = e.settings.tau[0 if self.coarse is None else 1], e.settings.tau[1]
         for _ in range(e.steps):
             before = u
             u, pressure = self.step(u, pressure, measured, tau, outlier_scale(e.gauss_newton.settings.outlier, tau / last))

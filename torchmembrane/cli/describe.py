@@ -18,6 +18,7 @@ from ..results.status import Status
 from ..sensor.camera_tables import shared_image
 from ..sensor.factories import elastic_energy
 from ..sensor.inflated import InflatedSurface
+from ..sensor.parts import FRICTION
 from ..sensor.sensor import Sensor
 from ..sensor.units import hectopascal
 from ..sensor.views import FEWEST_LINES
@@ -169,6 +170,8 @@ def _material(sensor: Sensor, reconstructor: Reconstructor | None) -> list[str]:
     }
     words = [f"{key} {value:g}{per}" for key, (value, per) in known.items() if value is not None]
     lines = [", ".join([material.model, f"prestretch {material.prestretch:g}", *words])]
+    default = ", the default: friction in [material] changes it" * (material.friction == FRICTION)
+    lines.append(f"friction {material.friction:g} with what touches it{default}")
     relative = sensor.force_unit == "relative"
     if relative:
         lines.append("without shear_modulus and thickness forces are relative, in units of their product")

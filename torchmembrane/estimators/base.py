@@ -13,6 +13,7 @@ from ..control_flow import traced
 from ..errors import MembraneError
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
+from ..sensor.parts import FRICTION
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from .contacts import ContactPatches, Contacts
@@ -34,6 +35,7 @@ class Problem(NamedTuple):
     rest_confidence  [D]  1 for markers whose rays at rest are used, 0 for others; None: all are used
     views            W, the number of views that see the markers; each marker is listed once for each view, and D counts all
     levers           [D, 3]  vectors from the positions to the visible points of the markers at rest; None: they coincide
+    friction         coefficient of friction between the membrane and what touches it
     """
 
     camera: Camera | Rig
@@ -49,6 +51,7 @@ class Problem(NamedTuple):
     rest_confidence: Tensor | None = None
     views: int = 1
     levers: Tensor | None = None
+    friction: float = FRICTION
 
     def cavity_law(self) -> CavityLaw:
         """Return the law of the cavity's filling; the rest pressure balances the membrane's tension."""
@@ -93,7 +96,6 @@ class Equilibrium(NamedTuple):
     moved          [B, 4 W]  motion of the camera of each of the W views relative to the rim
     objective      [B]  value of the objective function, per marker seen
     unexplained    [B]  the objective without the normal-compression term: misfit, normal tension and shear
-    pushed         [B]  share of the surface under compressive traction
     shared_misfit  [B]  the part of the misfit that neighbouring markers have in common
     """
 
@@ -107,7 +109,6 @@ class Equilibrium(NamedTuple):
     moved: Tensor
     objective: Tensor
     unexplained: Tensor
-    pushed: Tensor
     shared_misfit: Tensor
 
     @classmethod
@@ -122,7 +123,7 @@ class Equilibrium(NamedTuple):
         """
         none = torch.zeros_like(x)
         zero, still = none[..., 0, 0], none[..., :4, 0]
-        return cls(x, pressure, volume, none, step, none[..., 0], zero, still, zero, zero, zero, zero)
+        return cls(x, pressure, volume, none, step, none[..., 0], zero, still, zero, zero, zero)
 
 
 class Deviations(NamedTuple):

@@ -11,7 +11,9 @@ from .base import Problem
 LEAST_ERROR = 0.02  # smallest standard deviation of a marker's position, px
 
 
-def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, cavity: CavityFilling) -> Problem:
+def problem_of(
+    seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, cavity: CavityFilling, friction: float
+) -> Problem:
     """Return the problem of a sensor, in double precision.
 
     Args:
@@ -19,6 +21,7 @@ def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, c
         membrane: the rest surface on the solver's grid.
         elasticity: elastic energy of the membrane.
         cavity: filling of the cavity.
+        friction: coefficient of friction between the membrane and what touches it.
     """
     views = len(seen.positions) // len(seen.markers.positions)
     return Problem(
@@ -35,4 +38,5 @@ def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, c
         rest_confidence=None if views == 1 else seen.observer.seen_at_rest.double(),
         views=views,
         levers=seen.levers,
+        friction=friction,
     )

@@ -43,6 +43,7 @@ WORDS = {
         "prestretch": "stretch at rest, relative to the unstretched membrane, 1 or more",
         "shear_modulus": "N / length unit^2",
         "thickness": "thickness at rest: unstretched thickness / prestretch^2",
+        "friction": "coefficient of friction of the bodies that are expected; 0.5 if left out",
     },
     "cavity": {
         "filling": "liquid (keeps its volume) | gas (keeps pressure x volume) | open (keeps its pressure)",

@@ -24,7 +24,9 @@ from .working_range import GENERAL, WorkingRange
 if TYPE_CHECKING:
     from .views import View
 
-MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
+MOST_PRESTRETCH, MOST_C2_RATIO, MOST_FRICTION = 10.0, 1e3, 10.0
+FRICTION = 0.5
+"""Default coefficient of friction of a material."""
 POSITIVE = {"shear_modulus": (1e-12, 1e12), "thickness": (1e-6, 1e5), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e18)}
 """Lowest and highest allowed values, in the file's units; they are wide enough for every length unit."""
 FILLINGS = ("liquid", "gas", "open")
@@ -48,6 +50,7 @@ class Material:
         c2_ratio: C2 / C1, for "mooney_rivlin" only.
         shear_modulus: shear modulus, N per length unit squared; None: forces are relative.
         thickness: thickness at rest, after prestretching, length unit; None: forces are relative.
+        friction: Coulomb's coefficient of friction between the membrane and the bodies that are expected to touch it.
 
     Raises:
         MembraneError: a value is invalid; the message names it and says what was expected.
@@ -62,6 +65,7 @@ class Material:
     c2_ratio: float | None = None
     shear_modulus: float | None = None
     thickness: float | None = None
+    friction: float = FRICTION
 
     def __post_init__(self) -> None:
         meant = did_you_mean(self.model, MODELS)
@@ -75,6 +79,8 @@ class Material:
         else:
             expect(self.c2_ratio is None, "c2_ratio", self.c2_ratio, f"none, as model is {self.model}: remove it")
         _expect_positive(shear_modulus=self.shear_modulus, thickness=self.thickness)
+        expected = f"Coulomb's coefficient, from 0 (no friction) to {MOST_FRICTION:g}"
+        expect(0 <= self.friction <= MOST_FRICTION, "friction", self.friction, expected)
 
     @property
     def modulus(self) -> float:

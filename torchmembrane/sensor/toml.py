@@ -22,6 +22,7 @@ from .inflated import SHAPE as INFLATED
 from .inflated import read_inflated, rim_lines
 from .marker_checks import refuse_coincident, refuse_off_surface, refuse_tall
 from .parts import (
+    FRICTION,
     SHAPES_BY_ARRAYS,
     SHAPES_BY_NUMBERS,
     Cavity,
@@ -138,7 +139,7 @@ def tables_of(parts: SensorParts) -> dict[str, Any]:
         "": {"format": FORMAT, "name": parts.name, "length_unit": parts.length_unit},
         "camera": view_tables(parts.views) if parts.views else camera_table(camera),
         "membrane": {"shape": parts.surface.shape, "grid": list(parts.membrane.grid), **parts.surface.numbers()},
-        "material": asdict(material),
+        "material": {key: value for key, value in asdict(material).items() if (key, value) != ("friction", FRICTION)},
         "cavity": asdict(cavity),
         "markers": {"kind": markers.kind, "polarity": markers.polarity},
     }
@@ -180,8 +181,8 @@ def _read_tool(table: Table) -> Pose:
 
 
 def _read_material(table: Table) -> Material:
-    table.allow(("model", "prestretch", "c2_ratio", "shear_modulus", "thickness"))
-    numbers = {key: table.number(key) for key in ("c2_ratio", "shear_modulus", "thickness") if key in table}
+    table.allow(("model", "prestretch", *(optional := ("c2_ratio", "shear_modulus", "thickness", "friction"))))
+    numbers = {key: table.number(key) for key in optional if key in table}
     model, prestretch = table.text("model"), table.number("prestretch")
     with table.naming():
         return Material(model, prestretch, **numbers)

@@ -28,6 +28,7 @@ from torch import Tensor
 from ...control_flow import traced
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
+from ...sensor.parts import FRICTION
 from ...solve.stencil import pad_border
 from ...surface.bicubic import Refinement
 from ...surface.membrane import Membrane
@@ -44,8 +45,13 @@ from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
 from .starts import InitialGuess
 from .traction_loss import TractionLoss
-from .uncertainty import depths, gap_around, noise_effects, of_presses, shares_of_deepest, spreads, standard_deviations
+from .uncertainty import depths, gap_around, noise_of_pushes, of_presses, shares_of_deepest, spreads, standard_deviations
 
+AGED = 5e-4
+"""Increase of the limit of both reasons for doubt together, per inverse rms displacement: while the surface hardly moves, a
+rest image that has aged looks like a skin that is no membrane."""
+COARSEST = 6
+"""Smallest number of lines of a coarser grid."""
 MIN_RESOLVED_LINES = 17
 """Lines of a grid with a discretisation error below the markers' noise; on coarser ones it grows as the square of the step."""
 
@@ -67,8 +73,8 @@ class ForceBalance(Estimator):
         settings: all other settings.
         rest: the markers' rays at rest with their noise; None: rays from the origin, with `noise`.
         views: number of views that see the markers, which are listed once for each view.
-        is_coarse: whether a finer grid follows.
         levers: vectors from the markers to their visible tips at rest, `[D, 3]`; None: the markers lie on the surface.
+        friction: coefficient of friction between the membrane and what touches it.
 
     Limitations:
         The tractions of the press must exceed those due to noise. Two contacts within `reach` are not resolved.
@@ -94,28 +100,27 @@ class ForceBalance(Estimator):
         settings: ForceBalanceSettings | None = None,
         rest: Observation | None = None,
         views: int = 1,
-        is_coarse: bool = False,
         levers: Tensor | None = None,
+        friction: float = FRICTION,
     ):
         settings, spacing = settings or ForceBalanceSettings(), membrane.size / (len(positions) // views) ** 0.5
         super().__init__(membrane, CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas), settings, spacing)
-        self.size, self.coarseness = membrane.size, max(1.0, (MIN_RESOLVED_LINES - 1) / (min(membrane.grid) - 1)) ** 2
+        self.size, self.coarseness = membrane.size, _coarseness(membrane)
         self._far = settings.far * self.coarseness
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = residuals_of(membrane, markers, positions, noise, rest, views, levers)
-        self.coarse = self._coarser(elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views, levers=levers)
+        given = dict(rest=rest, filling=filling, gas=gas, views=views, levers=levers)
+        self.coarse = self._coarser(elasticity, bearings, friction, **given)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
-        if is_coarse and self.coarse is None:
-            settings = replace(settings, cone=settings.coarse_cone)
-        loss = TractionLoss(membrane, self.reference, settings)
+        loss = TractionLoss(membrane, self.reference, settings, friction)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
         self.gauss_newton = GaussNewton(self.equations, self.cavity, settings)
         self.dent = InitialGuess(self.gauss_newton) if self.coarse is not None and self.coarse.coarse is None else None
         self.steps = settings.steps[0 if self.coarse is None else 2 if self.dent is None else 1]
-        self._first_tau = settings.tau[0] if self.coarse is None else settings.fine_tau
+        self._first_tau = settings.tau[0 if self.coarse is None else 1]
         rest = seen_from_origin(bearings.seen_at_rest) if rest is None else rest
-        loss.push_noise, loss.noise_gain = noise_effects(self.equations, self.cavity, rest, settings.camera_motion)
+        loss.push_noise = noise_of_pushes(self.equations, self.cavity, rest, settings.camera_motion)
 
     @classmethod
     def from_problem(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> Self:
@@ -123,17 +128,23 @@ class ForceBalance(Estimator):
         rest, noise = rest_rays(problem)
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
         sensor = noise, problem.filling, problem.gas
-        return cls(*surface, *sensor, settings, rest, problem.views, levers=problem.levers)
+        return cls(*surface, *sensor, settings, rest, problem.views, levers=problem.levers, friction=problem.friction)
 
-    def _coarser(self, elasticity: ElasticEnergy, bearings: MarkerResiduals, **others: Any) -> Self | None:
+    def _coarser(self, elasticity: ElasticEnergy, bearings: MarkerResiduals, friction: float, **others: Any) -> Self | None:
+        """Return the estimator on every second line, or None if these are too few.
+
+        Where its discretisation error is larger, the scale of the markers' loss grows as the step of the grid, so that no
+        markers are lost to the error, and the friction falls as its square, because the error looks like friction.
+        """
         membrane, grid, positions = self.membrane, self.membrane.grid, bearings.positions
-        if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
+        if any(count % 2 == 0 or count < 2 * COARSEST - 1 for count in grid):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
         markers, material = every_second.closest_points(positions.numpy()), elasticity.for_membrane(every_second)
+        growth = _coarseness(every_second) / self.coarseness
         given = every_second, material, markers, positions, bearings.noise
-        settings = replace(self.settings, outlier=self.settings.coarse_outlier)
-        return type(self)(*given, settings=settings, is_coarse=True, **others)
+        settings = replace(self.settings, outlier=self.settings.outlier * growth**0.5)
+        return type(self)(*given, settings=settings, friction=friction / growth, **others)
 
     @property
     def must_compile(self) -> bool:
@@ -234,28 +245,25 @@ class ForceBalance(Estimator):
         angles = self.equations.bearings.angles(u, measured, moved)[0]
         unexplained = (steps.misfit(angles, pressure, measured) + terms.others) / seen
         objective = unexplained + terms.pushes / seen
-        gain = steps.objective_at_rest(measured) / seen - objective
-        scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, grid)[..., 0]
+        scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level)[..., None] - 1, grid)[..., 0]
         misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
-        reasons, traction = [objective, unexplained, loss.pushed(terms.compression2), shared], pad_border(traction.mT, grid)
+        reasons, traction = [objective, unexplained, shared], pad_border(traction.mT, grid)
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, *reasons)
 
     @traced
     def is_converged(self, found: Equilibrium) -> Tensor:
         """Return where the last step was short and the volume fulfils the cavity's law, `[B]` bool."""
-        error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
-        return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
+        error = self.cavity.volume_error(found.volume, found.pressure).abs()
+        return ~(found.relative_step.maximum(error) > self.settings.largest_error)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """Return where a surface of this sensor explains the markers, `[B]` bool: misfit, misfit shared by neighbours, tension
-        and shear without a push, the sum of the latter two, and the share of the surface in contact are below their limits."""
+        """Return where a surface of this sensor explains the markers, `[B]` bool: the objective without pushes, the misfit that
+        neighbours share, and the sum of both, each relative to its limit, are small."""
         settings, press = self.settings, self._press(found)
-        misfit = found.misfit / (settings.largest_misfit + settings.misfit_per_displacement * press) / self.coarseness
         largest = settings.largest_unexplained + settings.unexplained_per_displacement * press
         pulls = found.unexplained / largest / self.coarseness**2
-        alike, (most, aged) = found.shared_misfit / settings.largest_shared_misfit / self.coarseness, settings.largest_doubt
-        doubtful = (misfit.maximum(pulls).maximum(alike) > 1) | (pulls + alike > most + aged / press)
-        return torch.logical_not(doubtful | (found.pushed > settings.largest_pushed))
+        alike = found.shared_misfit / settings.largest_shared_misfit / self.coarseness
+        return torch.logical_not((pulls.maximum(alike) > 1) | (pulls + alike > 1 + AGED / press))
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Return the rms displacement relative to the size, `[B]`."""
@@ -288,3 +296,9 @@ class ForceBalance(Estimator):
         x, pressure, moved = (value.to(self.membrane.rest.dtype) for value in (x, pressure, moved))
         state = State(x - self.membrane.rest, pressure, moved)
         return standard_deviations(self.equations, self.cavity, self.settings, state, observation, marker_noise)
+
+
+def _coarseness(membrane: Membrane) -> float:
+    """Return the discretisation error of a grid relative to that of `MIN_RESOLVED_LINES` lines, at least 1."""
+    step: float = (MIN_RESOLVED_LINES - 1) / (min(membrane.grid) - 1)
+    return max(1.0, step * step)

@@ -18,7 +18,7 @@ from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
-from .schedule import LEAST_MOVE, falling, outlier_scale, scaled_step, settling_of
+from .schedule import LEAST_MOVE, SETTLING_DAMPING, falling, outlier_scale, scaled_step, settling_of
 from .settings import ForceBalanceSettings
 from .traction_loss import LossTerms
 
@@ -115,12 +115,6 @@ class GaussNewton(nn.Module):
         angles = self.equations.bearings.angles(state.u, measured, state.moved)[0]
         return self.misfit(angles, state.pressure, measured) + terms.others + terms.pushes
 
-    def objective_at_rest(self, measured: MeasuredRays) -> Tensor:
-        """Return the objective at rest, without camera motion and tractions, `[B]`."""
-        still, none = torch.zeros_like(self.membrane.rest[None]), torch.zeros_like(measured.noise_level)
-        angles = self.equations.bearings.angles(still, measured, none[:, None].expand(-1, measured.motion.shape[2]))[0]
-        return self.misfit(angles, none + self.cavity.rest_pressure, measured)
-
     def misfit(self, angles: Tensor, pressure: Tensor, measured: MeasuredRays) -> Tensor:
         """Return the part of the objective from markers with `angles [B, 2, D]`, and from a gauge, `[B]`."""
         misfit = measured.weight * angles.square().sum(1)
@@ -182,9 +176,7 @@ class GaussNewton(nn.Module):
         """
         kept, measured = others[:4], MeasuredRays(*others[4:])
         tau = torch.full_like(pressure, self.settings.tau[1])
-        state = self._compiled_step(
-            State(u, pressure, moved), measured, tau, torch.full_like(tau, self.settings.settling_damping)
-        )
+        state = self._compiled_step(State(u, pressure, moved), measured, tau, torch.full_like(tau, SETTLING_DAMPING))
         objective = self.objective(state, *self.tractions(*state[:2]), measured)
         settled = ~(self._scaled_step(u, state.u) > self.settings.settled_step_tol)
         best = where_rows(objective < lowest, (objective, *state, u), (lowest, *kept))
@@ -216,7 +208,7 @@ class GaussNewton(nn.Module):
             state: state before the step.
             measured: the markers' rays.
             tau: scale of the loss of compressive traction, `[B]`, on which the other scales depend.
-            damping: smallest relative increase of the matrix's diagonal, `[B]`.
+            damping: relative increase of the matrix's diagonal, `[B]`.
 
         Returns:
             The state after the step.
@@ -227,7 +219,7 @@ class GaussNewton(nn.Module):
         outlier = outlier_scale(torch.full_like(tau, settings.outlier), tau / last)
         _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
         loads = torch.cat([loads, motion.coupling], 1)
-        solved = self._solved(normal, loads, (settings.damping * blunt).maximum(damping)[:, None, None])
+        solved = self._solved(normal, loads, damping[:, None, None])
         motion = motion.with_prior(moved, settings.camera_motion * blunt[:, None])
         products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)

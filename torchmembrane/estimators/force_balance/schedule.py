@@ -3,8 +3,8 @@
 The loss of compressive traction is quadratic up to the scale `tau`, and saturates beyond it. If `tau` falls slowly, the steps
 stay in the basin of the one minimum that the smooth problem has (graduated non-convexity, GNC). How slowly it must fall differs
 from frame to frame: while a step still moves the surface far, `tau` falls by a seventh; the less the surface moves, compared
-with its displacement from rest, the faster `tau` falls. The scale of the markers' loss, the damping of a step and the prior of
-the camera's motion follow `tau`.
+with its displacement from rest, the faster `tau` falls. The scale of the markers' loss and the prior of the camera's motion
+follow `tau`.
 """
 
 from typing import TypeVar
@@ -28,6 +28,8 @@ LEAST_MOVE = 1e-9
 """Relative displacement below which a surface stands still; keeps quotients finite."""
 SETTLING_STEPS = 8
 """Number of damped steps for frames that have not settled before; at most half of all steps."""
+SETTLING_DAMPING = 1e-3
+"""Relative increase of the diagonal of the matrix in these steps."""
 
 
 def scaled_step(moved: Scalar, displacement: Scalar) -> Scalar:

@@ -6,8 +6,10 @@ A traction `q` of a vertex has the normal part `q_n` (positive outwards: tensile
     loss / area = sparsity / size^2 [ f(s) + kappa (sqrt(|q_t|^2 / p0^2 + slip^2) - slip) ],
 
 where `f` is Geman-McClure's loss of scale `tau` for a push (compressive traction), `s^2 / 2` for a tensile traction, and
-`kappa = friction / (1 + cone S)`. Because contacts are patches, the weights depend on the neighbourhood: `S` is the rms push
-over a Gaussian neighbourhood.
+`kappa = shear / (1 + 2 mu shear S / tau^2)` with the coefficient of friction `mu`. It is smaller on coarser grids of few lines,
+because their discretisation error looks like friction. Shear is expensive where nothing pushes. Under a large push the shear
+`mu S` of a sliding contact costs `tau^2 / 2`, as much as the push itself. Because contacts are patches, the weights depend on
+the neighbourhood: `S` is the rms push over a Gaussian neighbourhood.
 
 A light touch, smeared over many vertices, pushes with far less than `p0`. Every traction is therefore measured relative to
 `rho p0` instead of `p0`, with
@@ -34,6 +36,7 @@ from .settings import ForceBalanceSettings
 POWER = 4  # exponent of the power mean of squared pushes, which approximates their maximum
 NO_CONTACT_SCALE = 1e6  # relative to p0; far above any push
 NEGLIGIBLE = 1e-6  # weight of a distant vertex relative to that of the centre, below which it is zero
+WIDER = 2  # radius of the wider neighbourhood, relative to `reach`
 LEAST_SCALE = 0.02  # relative to p0; single precision rounds the tractions of a slack sheet by up to a fifth of this
 TINY = 1e-12  # keeps roots and quotients of zeros finite
 
@@ -61,17 +64,17 @@ class TractionLoss(nn.Module):
         membrane: the rest surface on the solver's grid.
         reference: reference traction `p0`.
         settings: settings of the estimator.
+        friction: coefficient of friction `mu` between the membrane and what touches it.
     """
 
     area: Tensor
     surroundings: Tensor
     wider: Tensor
     push_noise: Tensor
-    noise_gain: Tensor
 
-    def __init__(self, membrane: Membrane, reference: float, settings: ForceBalanceSettings):
+    def __init__(self, membrane: Membrane, reference: float, settings: ForceBalanceSettings, friction: float):
         super().__init__()
-        self.reference, self.size, self.settings = reference, membrane.size, settings
+        self.reference, self.size, self.settings, self.friction = reference, membrane.size, settings, friction
         self.shear = PseudoHuber(settings.slip)
 
         def within(field: Tensor) -> Tensor:
@@ -80,10 +83,9 @@ class TractionLoss(nn.Module):
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         surroundings = _gaussian_mean(membrane, settings.reach * self.size)
         self.register_buffer("surroundings", rounded_to_float32(within(within(surroundings).mT).mT))
-        wider = within(within(_gaussian_mean(membrane, settings.scale_reach * self.size)).mT).mT
+        wider = within(within(_gaussian_mean(membrane, WIDER * settings.reach * self.size)).mT).mT
         self.register_buffer("wider", rounded_to_float32(wider / wider.sum(0)))
         self.register_buffer("push_noise", torch.zeros_like(self.area))
-        self.register_buffer("noise_gain", self.area.new_zeros(()))
 
     def parts(self, traction: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return normal traction over `p0`, squared shear over `p0^2` and the mean squared push `S^2`, `[B, N]` each.
@@ -102,14 +104,15 @@ class TractionLoss(nn.Module):
         compression2: Tensor = (-q_n / self.reference).clamp_min(0) ** 2 @ self.surroundings
         return compression2
 
-    def pushed(self, compression2: Tensor) -> Tensor:
-        """Return the share `[B]` of the surface with a push above the last scale `tau`, from `S^2 [B, N]`."""
-        return (compression2 > self.settings.tau[-1] ** 2).to(self.area.dtype) @ self.area / self.area.sum()
+    @property
+    def cone(self) -> float:
+        """How much a push reduces the weight of shear, `2 mu shear / tau^2`."""
+        return 2 * self.friction * self.settings.shear / self.settings.tau[-1] ** 2
 
     def shear_weight(self, compression2: Tensor) -> Tensor:
         """Return `kappa [B, N]` for squared pushes `S^2 [B, N]`."""
         settings = self.settings
-        return settings.friction / (1 + settings.cone * (compression2 + settings.slip**4).sqrt())
+        return settings.shear / (1 + self.cone * (compression2 + settings.slip**4).sqrt())
 
     def scale2(self, compression2: Tensor, noise_level: Tensor, tau: Tensor) -> Tensor:
         """Return `rho^2 [B, N]` from `S^2 [B, N]` and the frames' noise relative to that at rest, `[B]`.
@@ -125,18 +128,16 @@ class TractionLoss(nn.Module):
         least = (tau / last - 1).clamp(LEAST_SCALE, 1.0)[:, None]
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
-    def contact_scale(self, terms: LossTerms, noise_level: Tensor, gain: Tensor) -> Tensor:
+    def contact_scale(self, terms: LossTerms, noise_level: Tensor) -> Tensor:
         """Return the scale with which pushes are compared in the search for contacts, relative to `p0`, `[B, N]`.
 
-        It is `rho`, or `NO_CONTACT_SCALE` where noise explains the push, or if noise explains the whole solution.
+        It is `rho`, or `NO_CONTACT_SCALE` where noise explains the push.
 
         Args:
             terms: loss of the tractions of a solution.
             noise_level: noise of the frames relative to that at rest, `[B]`.
-            gain: decrease of the objective from the surface at rest, per marker seen, `[B]`.
         """
         above = terms.compression2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
-        above = above & (gain > self.settings.evidence * self.noise_gain)[:, None]
         return torch.where(above, terms.scale2.sqrt(), NO_CONTACT_SCALE)
 
     def weights(

@@ -117,11 +117,8 @@ def linearise(
 
 
 @torch.no_grad()
-def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> tuple[Tensor, Tensor]:
-    """Return effects of the markers' noise at rest while all losses are quadratic.
-
-    They are the standard deviation of the push `S [N]`, and the mean decrease `[]` of the objective, per marker, when the
-    surface follows the noise.
+def noise_of_pushes(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> Tensor:
+    """Return the standard deviation of the push `S [N]` due to the markers' noise at rest, while all losses are quadratic.
 
     Args:
         equations: equations of force balance.
@@ -139,8 +136,8 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
     dx, dp = changes(solution, loads)
     dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
     push = (dq * at.normal[:, None]).sum(2) / (loss.area * loss.reference)
-    gain = 0.5 * (loads * dx).sum() / measured.weight.sum()
-    return (push.square().sum(1) @ loss.surroundings).sqrt()[0], gain
+    noise: Tensor = (push.square().sum(1) @ loss.surroundings).sqrt()[0]
+    return noise
 
 
 def noise_loads(

@@ -60,7 +60,7 @@ class Numbers(NamedTuple):
 
     reference: float
     size: float
-    friction: float
+    shear: float
     slip: float
     cone: float
     sparsity: float
@@ -71,14 +71,10 @@ class Numbers(NamedTuple):
     far_share: float
     noise_share: float
     camera_motion: float
-    damping: float
-    settling_damping: float
     settled_step_tol: float
     largest_stretch: float
     contact_noise: float
-    evidence: float
     outlier: float
-    noise_gain: float
     rest_pressure: float
     rest_volume: float
     is_open: bool
@@ -196,7 +192,7 @@ def weigh(c, work, noise_level, tau, curvature):
 @compiled
 def weight_of_shear(k, push2):
     """Return `TractionLoss.shear_weight`."""
-    return k.friction / (1 + k.cone * np.sqrt(push2 + k.slip**4))
+    return k.shear / (1 + k.cone * np.sqrt(push2 + k.slip**4))
 
 
 @compiled

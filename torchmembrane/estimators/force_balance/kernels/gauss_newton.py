@@ -12,7 +12,7 @@ from ....mechanics.native_membrane import linearise
 from ....solve.native_band import RANK, ROWS, backward, factor
 from ....solve.symmetric_2x2 import symmetric_solution
 from ..camera_motion import camera_stiffness
-from ..schedule import LEAST_MOVE, falling, outlier_scale, scaled_step
+from ..schedule import LEAST_MOVE, SETTLING_DAMPING, falling, outlier_scale, scaled_step
 from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, sum_blocks, weigh
 from .markers import load_markers
 from .solution import OBJECTIVE, TOLD, solution_of
@@ -42,7 +42,7 @@ def settle(c, work, u, pressure, moved, before, seen, noise_level, gauge, tau, s
     for _ in range(settling):
         if not done:
             before[:] = u
-            step(c, work, u, pressure, moved, seen, noise_level, gauge, k.last_tau, k.settling_damping)
+            step(c, work, u, pressure, moved, seen, noise_level, gauge, k.last_tau, SETTLING_DAMPING)
             done = not _scaled_step(c, u, before) > k.settled_step_tol
             solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, 1.0, told, traction, reference)
             if told[OBJECTIVE] < lowest:
@@ -65,11 +65,10 @@ def _scaled_step(c, u, before):
 
 
 @compiled
-def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, least_damping):
+def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, damping):
     """Take one step in place: `u [m, n, 3]`, `pressure [1]` and `moved [4]` are overwritten."""
     (m, n), k = c.surface.free.shape, c.numbers
     outlier = scale_of_outliers(k.outlier, tau / k.last_tau)
-    damping = max(k.damping * blunt_at(k, tau), least_damping)
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
     own, slope = np.zeros((4, 4)), np.zeros(4)
     weigh(c, work, noise_level, tau, np.bool_(False))
@@ -130,7 +129,7 @@ def substituted(work, solved):
 
 @compiled
 def blunt_at(k, tau):
-    """Return by how much a step at a scale `tau` is damped more than at the last one."""
+    """Return by how much a step at a scale `tau` lets the camera move more than at the last one."""
     return (min(tau, k.first_tau) / k.last_tau) ** 2
 
 

@@ -9,15 +9,15 @@ from ..traction_loss import NO_CONTACT_SCALE
 from .equations import scaled, weight_of_shear
 from .markers import place_of, turned
 
-STEP, VOLUME, MISFIT, OBJECTIVE, UNEXPLAINED, PUSHED, SHARED = range(7)
+STEP, VOLUME, MISFIT, OBJECTIVE, UNEXPLAINED, SHARED = range(6)
 """Places in what is `told` of a frame."""
-TOLD = 7
+TOLD = 6
 loss_of_push = compiled(geman_mcclure_loss)
 
 
 @compiled
 def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, far, told, traction, reference):
-    """Compute `told [7]`, `traction [m, n, 3]` and `reference [m, n]` of a state; `far` is the limit of a marker's angle."""
+    """Compute `told [6]`, `traction [m, n, 3]` and `reference [m, n]` of a state; `far` is the limit of a marker's angle."""
     (m, n), k, step2 = c.surface.free.shape, c.numbers, 0.0
     told[VOLUME] = linearise(c.surface, u, pressure, work.force, work.A, work.volume)
     scaled(c, work, noise_level, k.last_tau)
@@ -28,24 +28,22 @@ def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, f
                 traction[i, j, a] = 0.0
             reference[i, j] = k.reference
     told[STEP] = np.sqrt(step2 / (m * n)) / k.size
-    pushes, others = _tractions(c, work, told, traction)
-    count, misfit, at_rest = _markers(c, u, moved, seen, far, told)
+    pushes, others = _tractions(c, work, traction)
+    count, misfit = _markers(c, u, moved, seen, far, told)
     rise = pressure[0] - k.rest_pressure
     misfit += gauge[1] * (rise - gauge[0]) ** 2 / 2
     told[UNEXPLAINED] = (misfit + others) / count
     told[OBJECTIVE] = told[UNEXPLAINED] + pushes / count
-    gain = (at_rest + gauge[1] * gauge[0] ** 2 / 2) / count - told[OBJECTIVE]
     for i in range(len(c.area)):
-        above = work.fields[2, i] > (k.contact_noise * noise_level * c.push_noise[i]) ** 2 and gain > k.evidence * k.noise_gain
+        above = work.fields[2, i] > (k.contact_noise * noise_level * c.push_noise[i]) ** 2
         scale = np.sqrt(work.fields[3, i]) if above else NO_CONTACT_SCALE
         reference[i // (n - 2) + 1, i % (n - 2) + 1] = k.reference * scale
 
 
 @compiled
-def _tractions(c, work, told, traction):
-    """Apply `TractionLoss.forward`: return the loss of pushes and that of pulls and shear, the tractions, and the pushed
-    share of the area."""
-    k, n, pushes, others, whole, pushed = c.numbers, c.surface.free.shape[1], 0.0, 0.0, 0.0, 0.0
+def _tractions(c, work, traction):
+    """Apply `TractionLoss.forward`: return the loss of pushes and that of pulls and shear; write the tractions."""
+    k, n, pushes, others = c.numbers, c.surface.free.shape[1], 0.0, 0.0
     for i in range(len(c.area)):
         p, q, unit = i // (n - 2) + 1, i % (n - 2) + 1, k.sparsity / k.size**2 * c.area[i]
         for a in range(3):
@@ -57,23 +55,16 @@ def _tractions(c, work, told, traction):
         else:
             others += unit * q_n * q_n / 2
         others += unit * weight_of_shear(k, push2 / rho2) * (np.sqrt(shear2 + k.slip**2) - k.slip)
-        whole += c.area[i]
-        pushed += c.area[i] if push2 > k.last_tau**2 else 0.0
-    told[PUSHED] = pushed / whole
     return pushes, others
 
 
 @compiled
 def _markers(c, u, moved, seen, far, told):
-    """Apply `MarkerResiduals.misfits`; return also the number of visible markers, and their loss for this state and at rest
-    with an unmoved camera."""
+    """Apply `MarkerResiduals.misfits`; return also the number of visible markers, and their loss."""
     weight, k, count = seen[2], c.numbers, len(seen[2])
     place, jacobian, angle, here = np.zeros(3), np.zeros((2, 3)), np.zeros(2), np.empty((count, 2))
-    still, total, misfit, at_rest, counted = np.zeros_like(moved), 0.0, 0.0, 0.0, 0.0
+    total, misfit, counted = 0.0, 0.0, 0.0
     for d in range(count):
-        for a in range(3):
-            place[a] = c.positions[d, a]
-        at_rest += _cauchy(weight[d] * turned(seen, d, place, still, jacobian, angle), k.outlier)
         place_of(c, u, d, place)
         square = turned(seen, d, place, moved, jacobian, angle)
         misfit += _cauchy(weight[d] * square, k.outlier)
@@ -88,7 +79,7 @@ def _markers(c, u, moved, seen, far, told):
             shared += here[d, 0] * here[other, 0] + here[d, 1] * here[other, 1]
             pairs += weight[d] * weight[other]
     told[MISFIT], told[SHARED] = np.sqrt(counted / max(total, 1.0)), np.sqrt(max(shared / max(pairs, 1.0), 0.0))
-    return max(total, 1.0), misfit, at_rest
+    return max(total, 1.0), misfit
 
 
 @compiled

@@ -141,7 +141,7 @@ class NativeSteps:
     def _found(self, equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Constants:
         forces, loss, bearings = equations.forces, equations.loss, equations.bearings
         elasticity, membrane = forces.elasticity, forces.membrane
-        material = elasticity.prestretch, elasticity.c1, elasticity.c2, cavity.rest_pressure
+        material = elasticity.prestretch, elasticity.c1, elasticity.c2, cavity.rest_pressure, loss.friction
         places = forces.rest_load, membrane.rest, loss.surroundings, bearings.positions
         key = dtype, loss.settings, *(float(value) for value in material), *(value.data_ptr() for value in places)
         if self._constants is None or self._constants[0] != key:
@@ -158,7 +158,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         size=loss.size,
         last_tau=settings.tau[1],
         first_tau=settings.tau[0],
-        noise_gain=float(loss.noise_gain),
+        cone=loss.cone,
         rest_pressure=float(cavity.rest_pressure),
         rest_volume=_volume(surface),
         is_open=cavity.filling == "open",
