@@ -21,6 +21,7 @@ from torchmembrane.estimators.force_balance.schedule import (
     settling_of,
 )
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.estimators.force_balance.traction_loss import WIDER
 from torchmembrane.machine_code import using
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.sensor.parts import FRICTION
@@ -223,6 +224,30 @@ def test_of_the_damped_steps_the_likeliest_state_is_kept(dented, monkeypatch):
         torch.testing.assert_close(kept, torch.stack([at[1][0], at[0][1]]), rtol=0, atol=0)
     torch.testing.assert_close(before[0], judged[0].u[0], rtol=0, atol=0)
     assert 0 < (before[1] - judged[0].u[1]).abs().max() < 0.1 * one.size
+
+
+def test_a_solution_has_converged_if_its_last_step_was_short_and_its_volume_is_kept(dented):
+    """Just below and just above what is allowed of either, and a volume that is as much too small."""
+    one, limit = estimator(), SETTINGS.largest_error
+    found = one(dented)
+    found = type(found)(*(value[:1].repeat(5, *[1] * (value.ndim - 1)) for value in found))
+    step = limit * torch.tensor([0.99, 1.01, 0.0, 0.0, 0.0]).double()
+    off = limit * torch.tensor([0.0, 0.0, 0.99, 1.01, -1.01]).double()
+    found = found._replace(relative_step=step, volume=one.membrane.rest_volume * (1 + off))
+    assert one.is_converged(found).tolist() == [True, False, True, False, False]
+
+
+def test_pushes_are_compared_with_the_largest_one_in_a_neighbourhood_twice_as_wide_as_that_of_a_push():
+    """Weights of the mean around the vertex in the middle, per area."""
+    loss, rest = estimator().equations.loss, DOME.rest[~DOME.fixed]
+    middle = len(rest) // 2
+    distance2 = (rest - rest[middle]).square().sum(1)
+    near = distance2 < (4 * SETTINGS.reach * DOME.size) ** 2
+    for weights, reach in ((loss.surroundings, SETTINGS.reach), (loss.wider, WIDER * SETTINGS.reach)):
+        share = (weights[:, middle] / loss.area)[near]
+        expected = torch.exp(-distance2[near] / (2 * (reach * DOME.size) ** 2))
+        torch.testing.assert_close(share / share.max(), expected, rtol=1e-4, atol=1e-6)
+    assert WIDER == 2
 
 
 def test_what_neighbouring_markers_have_in_common_is_a_reason_to_doubt_what_each_has_alone_is_none():
