@@ -65,7 +65,13 @@ def reconstructor(small_sensor, case):
 
 
 @pytest.fixture(scope="module")
-def model_file(reconstructor, tracking, tmp_path_factory):
+def shares():
+    """What `export` tells of its progress."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def model_file(reconstructor, tracking, shares, tmp_path_factory):
     """The model, whose session is opened once: by `export`, which checks it."""
     path, checked = tmp_path_factory.mktemp("model") / "model.onnx", []
 
@@ -75,7 +81,7 @@ def model_file(reconstructor, tracking, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("onnxruntime.InferenceSession", session)
-        export.export(reconstructor, path, tracking=tracking)
+        export.export(reconstructor, path, tracking=tracking, progress=lambda share, step: shares.append((share, step)))
     assert path.read_bytes() == export.sealed(*checked)
     return path
 
@@ -135,6 +141,14 @@ def test_an_exported_file_ends_in_the_digest_of_what_is_before_it(model_file):
     assert (
         content == export.sealed(whole) and onnx.ModelProto.FromString(content).graph == onnx.ModelProto.FromString(whole).graph
     )
+
+
+def test_the_share_told_before_the_last_pieces_is_that_of_the_nodes_of_so_many_grids(model_file, shares):
+    """It neither stays behind nor stands still long before the check."""
+    told = [share for share, step in shares if not step.startswith("check")]
+    assert told == sorted(told) and told[0] == 0.0
+    assert 0.75 * export.CHECK < told[-1] <= export.CHECK and told.count(export.CHECK) <= 2
+    assert shares[-1] == (export.CHECK, "check against torch")
 
 
 def test_the_model_agrees_with_torch(run, reconstructor, images):
