@@ -101,7 +101,7 @@ def test_the_tutorial_ends_with_the_force_in_newtons(tmp_path, monkeypatch, caps
     for call in commands(TUTORIAL):
         assert main(call) == 0, call
     row = assert_newtons()
-    assert f"says {float(row['force']):.2f} N; the truth is {row['true']:.3f} N" in words(TUTORIAL)
+    assert f"{float(row['force']):.2f} N; the true force is {row['true']:.3f} N" in words(TUTORIAL)
     weight = float(np.linalg.norm(np.load("photos/weight_truth.npz")["force"]))
     (grams,) = re.findall(r"--weight ([\d.]+)g", TUTORIAL)
     assert float(grams) * 9.80665e-3 == pytest.approx(weight, rel=1e-3)
@@ -120,7 +120,7 @@ def test_the_bubble_s_gauge_gives_newtons(tmp_path, monkeypatch):
     hectopascal = 1e4 * float(gauged["p"] - gauged["p0"])
     assert float(readings.split("gauged,")[1]) == pytest.approx(hectopascal, abs=0.006)
     row = assert_newtons()
-    assert f"says {float(row['force']):.2f} N; the truth is {row['true']:.3f} N" in words(BUBBLE)
+    assert f"{float(row['force']):.2f} N; the true force is {row['true']:.3f} N" in words(BUBBLE)
     found = tomllib.loads(Path("material/sensor.toml").read_text())["material"]
     assert f"prestretch of {found['prestretch']:.2f} ±" in words(BUBBLE)
 
@@ -131,7 +131,7 @@ def test_the_window_s_ruler_and_gauge_give_newtons(tmp_path, monkeypatch):
     for call in commands(WINDOW):
         assert main(call) == 0, call
     row = assert_newtons()
-    assert f"says {float(row['force']):.3f} N; the truth is {row['true']:.3f} N" in words(WINDOW)
+    assert f"{float(row['force']):.3f} N; the true force is {row['true']:.3f} N" in words(WINDOW)
 
 
 def test_the_recipes_python_runs(monkeypatch):
