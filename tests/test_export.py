@@ -55,14 +55,14 @@ def tracking(case):
 
 @pytest.fixture(scope="module")
 def reconstructor(small_sensor, case):
-    """On the smallest grid that has a coarser one; frames take steps until rounding no longer decides which was the last one.
-    The sheet full of gas is so slack that it is solved in double precision."""
-    sensor = Sensor.from_file(small_sensor / "sensor.toml")
-    sensor = replace(sensor, membrane=sensor.surface.membrane((11, 11)))
+    """On grids that have a coarser one; frames take steps until rounding no longer decides which was the last one. The sheet
+    full of gas is so slack that it is solved in double precision."""
+    sensor, lines = Sensor.from_file(small_sensor / "sensor.toml"), 11 if case[0] == "gas" else 17
+    sensor = replace(sensor, membrane=sensor.surface.membrane((lines, lines)))
     if case[0] == "gas":
         sensor = replace(sensor, material=replace(sensor.material, prestretch=1.1), cavity=Cavity("gas", 1013.0))
     made = Reconstructor(sensor, settings=ForceBalanceSettings(steps=(400, 200, 100), settled_step_tol=2e-6))
-    assert made.estimator.coarse.membrane.grid == (6, 6) and made.estimator.solves_in_double == (case[0] == "gas")
+    assert made.estimator.coarse is not None and made.estimator.solves_in_double == (case[0] == "gas")
     return made
 
 
@@ -160,7 +160,7 @@ def test_the_model_agrees_with_torch(run, reconstructor, images):
         together = reconstructor(images)
     assert together.status.tolist() == [Status.OK] * 3
     agree(run(images), together)
-    assert together.displacement[2].norm(dim=-1).max() > 0.9
+    assert together.displacement[2].norm(dim=-1).max() > 1
     agree(run(images[:1]), Reconstruction(*(field[:1] for field in together)))
 
 
@@ -293,9 +293,8 @@ def test_edge_runs_without_torch(edge_calls, reconstructor, tracking, images, ba
     assert mesh.camera_in_tool.shape == (0, 4) and mesh.tool is None
 
 
-def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, reconstructor, tracking, edge_calls, images, edge):
-    """It says of itself and gives what the model as ONNX does, but for rounding: onnxruntime joins other nodes in it. Single
-    precision rounds deviations, and curvatures of flat contacts, more than the surface."""
+def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, tracking, edge_calls, images, edge):
+    """It says of itself and gives what the model as ONNX does, but for rounding: onnxruntime joins other nodes in it."""
     from torchmembrane_edge.images import frames
 
     plain, (done, folder) = edge.Session(model_file), edge_calls
@@ -303,12 +302,10 @@ def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, reconstruct
     assert Mesh.load(folder / "mesh.npz").sensor == plain.mesh["sensor"]
     read = [next(iter(frames(path, plain.image_size))).image for path in images]
     expected = plain.track(read) if tracking else map(plain.run, read)
-    rougher = {"contact_curvature": 1e-3, "depth_deviation": 1e-4, "force_deviation": 1e-4}
     for path, results in zip(images, expected, strict=True):
         found = load_frame(folder / f"{path.stem}.npz")
         for name, values in results.items():
-            share = 3e-5 if reconstructor.estimator.solves_in_double else rougher.get(name, 3e-5)
-            rounding = share * max(1.0, np.nanmax(abs(values[0]))) if values.dtype.kind == "f" else 0
+            rounding = 3e-5 * max(1.0, np.nanmax(abs(values[0]))) if values.dtype.kind == "f" else 0
             np.testing.assert_allclose(found[name], values[0], rtol=0, atol=rounding, err_msg=name)
 
 

@@ -228,11 +228,11 @@ def test_of_the_damped_steps_the_likeliest_state_is_kept(dented, monkeypatch):
 
 def test_a_solution_has_converged_if_its_last_step_was_short_and_its_volume_is_kept(dented):
     """Just below and just above what is allowed of either, and a volume that is as much too small."""
-    one, limit = estimator(), SETTINGS.largest_error
+    one = estimator()
     found = one(dented)
     found = type(found)(*(value[:1].repeat(5, *[1] * (value.ndim - 1)) for value in found))
-    step = limit * torch.tensor([0.99, 1.01, 0.0, 0.0, 0.0]).double()
-    off = limit * torch.tensor([0.0, 0.0, 0.99, 1.01, -1.01]).double()
+    step = SETTINGS.largest_relative_step * torch.tensor([0.99, 1.01, 0.0, 0.0, 0.0]).double()
+    off = SETTINGS.largest_volume_error * torch.tensor([0.0, 0.0, 0.99, 1.01, -1.01]).double()
     found = found._replace(relative_step=step, volume=one.membrane.rest_volume * (1 + off))
     assert one.is_converged(found).tolist() == [True, False, True, False, False]
 

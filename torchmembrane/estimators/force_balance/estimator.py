@@ -50,7 +50,7 @@ from .uncertainty import depths, gap_around, noise_of_pushes, of_presses, shares
 AGED = 5e-4
 """Increase of the limit of both reasons for doubt together, per inverse rms displacement: while the surface hardly moves, a
 rest image that has aged looks like a skin that is no membrane."""
-COARSEST = 6
+COARSEST_LINES = 6
 """Smallest number of lines of a coarser grid."""
 MIN_RESOLVED_LINES = 17
 """Lines of a grid with a discretisation error below the markers' noise; on coarser ones it grows as the square of the step."""
@@ -137,7 +137,7 @@ class ForceBalance(Estimator):
         markers are lost to the error, and the friction falls as its square, because the error looks like friction.
         """
         membrane, grid, positions = self.membrane, self.membrane.grid, bearings.positions
-        if any(count % 2 == 0 or count < 2 * COARSEST - 1 for count in grid):
+        if any(count % 2 == 0 or count < 2 * COARSEST_LINES - 1 for count in grid):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
         markers, material = every_second.closest_points(positions.numpy()), elasticity.for_membrane(every_second)
@@ -253,8 +253,8 @@ class ForceBalance(Estimator):
     @traced
     def is_converged(self, found: Equilibrium) -> Tensor:
         """Return where the last step was short and the volume fulfils the cavity's law, `[B]` bool."""
-        error = self.cavity.volume_error(found.volume, found.pressure).abs()
-        return ~(found.relative_step.maximum(error) > self.settings.largest_error)
+        error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
+        return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """Return where a surface of this sensor explains the markers, `[B]` bool: the objective without pushes, the misfit that

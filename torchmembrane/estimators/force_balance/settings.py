@@ -52,8 +52,8 @@ class ForceBalanceSettings:
         pressure_noise: standard deviation of a measured pressure, relative to the reference traction (mostly the rest
             pressure). Use this value for better gauges as well.
         largest_stretch: largest relative change of an edge of the grid in one step.
-        largest_error: largest rms of the last step of a converged solution; also its largest volume error, relative to the rest
-            volume.
+        largest_relative_step: largest rms of the last step of a converged solution.
+        largest_volume_error: largest volume error of a converged solution, relative to the rest volume.
         largest_unexplained: largest objective without the normal-compression term, per marker seen, that a surface of this
             sensor explains; it is larger on grids of fewer than `force_balance.MIN_RESOLVED_LINES` lines.
         unexplained_per_displacement: increase of this limit per displacement (rms): the grid's error grows with the press.
@@ -82,7 +82,8 @@ class ForceBalanceSettings:
     outlier: float = 2.5
     pressure_noise: float = 0.01
     largest_stretch: float = 0.3
-    largest_error: float = 2e-3
+    largest_relative_step: float = 2e-3
+    largest_volume_error: float = 1e-3
     largest_unexplained: float = 2.0
     unexplained_per_displacement: float = 30.0
     largest_shared_misfit: float = 1.35
