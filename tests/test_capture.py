@@ -13,7 +13,7 @@ from PIL import Image
 from torchmembrane.cli.main import main
 from torchmembrane.files.timestamps import time_in
 from torchmembrane.live import capture
-from torchmembrane.live.capture import SETTLING, STALE, Held, hold
+from torchmembrane.live.capture import SETTLING, STALE, Held, Photographs, hold
 
 ROOT = Path(__file__).parents[1]
 AUTO = {"AUTO_EXPOSURE": 3.0, "AUTO_WB": 1.0, "AUTOFOCUS": 1.0}
@@ -112,6 +112,12 @@ def test_photographs_of_two_cameras_bear_the_names_of_their_views(monkeypatch, t
     names = sorted(path.stem for path in tmp_path.iterdir())
     assert [name.partition("_")[2] for name in names] == ["left", "right"] * 2 and names[0][:-5] == names[1][:-6]
     assert all(np.isfinite(time_in(name)) for name in names) and all(driver.released for driver in drivers.values())
+
+
+def test_two_photographs_in_one_millisecond_have_two_names(monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: Driver([]))
+    names = [name for name, _ in Photographs(0).take(20)]
+    assert len(set(names)) == 20 and names == sorted(names)
 
 
 def test_a_photograph_of_another_size_than_the_sensor_s_is_refused(monkeypatch, small_sensor, tmp_path, capsys):

@@ -106,13 +106,18 @@ class Photographs:
         Yields:
             The name, a time such as `20260927T113829250`, and the image, RGB `[height, width, 3]` or grey `[height, width]`.
         """
-        due = time.monotonic()
+        due, taken = time.monotonic(), ""
         try:
             for _ in range(count):
-                image = next(self._images)
-                while time.monotonic() < due:  # what comes meanwhile is dropped: none waits in the driver
-                    image = next(self._images)
-                due += every
-                yield datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")[:-3], image
+                image, name = next(self._images), _name_now()
+                while time.monotonic() < due or name == taken:  # what comes meanwhile is dropped: none waits in the driver
+                    image, name = next(self._images), _name_now()
+                due, taken = due + every, name
+                yield name, image
         finally:
             self._images.close()
+
+
+def _name_now() -> str:
+    """Return the time (UTC) in milliseconds as the name of a photograph."""
+    return datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")[:-3]
