@@ -72,7 +72,7 @@ VARIANTS = [
     *each("steps", "settled_step_tol", 1e-4, 1e-5),
     *(changed("steps", f"steps = (64, 32, {n})", steps=(64, 32, n)) for n in (4, 8, 32, 64)),
     *each("surroundings", "reach", 1e-6, 0.08),
-    *each("surroundings", "floor", 0.0, 1e-2),
+    *each("surroundings", "floor", 1e-5, 1e-2),
     *(Variant("marker noise", f"assumed {share:g} times as large", assumed=share) for share in (0.5, 2)),
     *(Variant("marker noise", f"{px:g} px added", noise=px) for px in (0.1, 0.2, 0.5)),
     *(Variant("number of dots", f"one in {n}", every=n) for n in (2, 4)),

@@ -42,12 +42,12 @@ class ForceBalanceSettings:
         scale_share: share of the largest push (compressive traction) around a vertex, within `WIDER` times `reach`, below
             which a push is small.
         far_share: the same as a share of the largest push on the whole surface.
-        noise_share: the same as a share of the push caused by the markers' noise alone, while all losses are quadratic.
         contact_noise: smallest ratio of a contact's push to the push due to noise; it must be large for its neighbourhood too.
         shear: weight of the loss of shear traction without a push, relative to that of compressive traction.
         slip: scale of the loss of shear traction, above which it is linear.
         reach: radius of the neighbourhood that determines whether a vertex is pushed.
-        floor: smallest weight of a compressive traction. Without it, the position of a vertex under a contact is undetermined.
+        floor: smallest weight of a compressive traction, between 0 and 1. Without it, the position of a vertex under a contact
+            would be undetermined. `noise_share` follows from it.
         outlier: scale of the markers' loss, relative to their noise; larger on coarser grids of few lines.
         pressure_noise: standard deviation of a measured pressure, relative to the reference traction (mostly the rest
             pressure). Use this value for better gauges as well.
@@ -73,7 +73,6 @@ class ForceBalanceSettings:
     sparsity: float = 9000.0
     scale_share: float = 0.2
     far_share: float = 0.05
-    noise_share: float = 0.6
     contact_noise: float = 3.2
     shear: float = 3.75
     slip: float = 0.05
@@ -93,6 +92,17 @@ class ForceBalanceSettings:
             raise MembraneError(f"ForceBalanceSettings: steps = {self.steps}; expected three numbers of at least 2")
         if not self.pressure_noise > 0:
             raise MembraneError(f"ForceBalanceSettings: pressure_noise = {self.pressure_noise}; expected more than 0")
+
+        if not 0 < self.floor < 1:
+            raise MembraneError(f"ForceBalanceSettings: floor = {self.floor}; expected more than 0 and less than 1")
+
+    @property
+    def noise_share(self) -> float:
+        """Share of the push caused by the markers' noise alone, while all losses are quadratic, below which a push is small.
+
+        A push that just counts as a contact, `contact_noise` times this noise, then has the weight `floor`.
+        """
+        return float(self.contact_noise / (self.floor**-0.5 - 1) ** 0.5)
 
     @property
     def far(self) -> float:
