@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -118,6 +119,19 @@ def test_two_photographs_in_one_millisecond_have_two_names(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda number: Driver([]))
     names = [name for name, _ in Photographs(0).take(20)]
     assert len(set(names)) == 20 and names == sorted(names)
+
+
+def test_after_a_late_photograph_the_next_one_waits_as_long(monkeypatch):
+    """The time between two photographs is counted from the first of them, not from when it was due."""
+
+    class Late(Driver):
+        def read(self):
+            time.sleep(0.02 * (self.reads == SETTLING + STALE))
+            return super().read()
+
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: Late([]))
+    first, second = (time_in(name) for name, _ in Photographs(0).take(2, 0.03))
+    assert second - first > 0.028
 
 
 def test_a_photograph_of_another_size_than_the_sensor_s_is_refused(monkeypatch, small_sensor, tmp_path, capsys):

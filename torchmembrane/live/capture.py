@@ -109,10 +109,10 @@ class Photographs:
         due, taken = time.monotonic(), ""
         try:
             for _ in range(count):
-                image, name = next(self._images), _name_now()
-                while time.monotonic() < due or name == taken:  # what comes meanwhile is dropped: none waits in the driver
-                    image, name = next(self._images), _name_now()
-                due, taken = due + every, name
+                image, now, name = next(self._images), time.monotonic(), _name_now()
+                while now < due or name == taken:  # what comes meanwhile is dropped: none waits in the driver
+                    image, now, name = next(self._images), time.monotonic(), _name_now()
+                due, taken = time.monotonic() + every, name
                 yield name, image
         finally:
             self._images.close()

@@ -73,7 +73,7 @@ class ForceBalanceSettings:
     sparsity: float = 9000.0
     scale_share: float = 0.2
     far_share: float = 0.05
-    contact_noise: float = 3.2
+    contact_noise: float = 3.32
     shear: float = 3.75
     slip: float = 0.05
     reach: float = 0.04
