@@ -15,7 +15,7 @@ This page lists every option of every command. `torchmembrane COMMAND --help` pr
 generates this page.
 
 `SENSOR.toml` may be `preset:NAME`, one of the [presets](presets.md). The exit code is 0 if all went well, 1 if some frames
-failed, 2 for wrong usage, 130 after Ctrl-C, and 143 after SIGTERM.
+failed, 2 for wrong usage, 130 after Ctrl-C, and 143 after SIGTERM; `live` ends with 0 after either.
 
 Ctrl-C or SIGTERM ends a command within some two seconds, or when the current frame is finished. Finished results are kept. A
 second Ctrl-C or SIGTERM ends the command at once; even then, no file is left half written. The same command, started again,

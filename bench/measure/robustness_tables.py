@@ -192,6 +192,7 @@ def degraded_images(found: dict) -> Rows:
     rows = [
         ["images", str(found["images"])],
         ["with a status other than ok", str(found["images"] - found["ok"])],
+        ["of these with a surface, off by less than a quarter of the press", str(found["cautious"])],
         ["with status ok", str(found["ok"])],
         ["of these off by more than a quarter of the press", str(found["wrong"])],
         ["of these mirrored or upside down, which cannot be noticed for a symmetric pattern", str(found["mirrored"])],
@@ -205,7 +206,8 @@ def degraded_summary(results: dict) -> dict:
     ok = [row for row in rows if row["status"] == 0]
     wrong = [row for row in ok if not row["surface"] < WRONG]
     mirrored = sum(row["way"] in ("mirrored", "upside down") for row in wrong)
-    return dict(images=len(rows), ok=len(ok), wrong=len(wrong), mirrored=mirrored)
+    cautious = sum(row["status"] != 0 and row["surface"] < WRONG for row in rows)
+    return dict(images=len(rows), ok=len(ok), wrong=len(wrong), mirrored=mirrored, cautious=cautious)
 
 
 def crash_recovery(*found: dict) -> Rows:

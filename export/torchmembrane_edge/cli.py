@@ -28,7 +28,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", "
 """File extensions of the images that are taken from a folder."""
 OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
 MOST_BATCH, MOST_NUMBER = 256, 10**9 - 1
-SECONDS_PER_MB = 2
+SECONDS_PER_MB = 0.5
 """Seconds that a PC core takes to load a model, per MB."""
 
 

@@ -24,7 +24,7 @@ SEAL, DIGEST = b"2ISHA-256: ", 64  # the `doc_string` with which an exported fil
 
 
 class Session:
-    """A model ready to run. Loading takes about 2 s per MB of the file on one core, because onnxruntime optimises the model.
+    """A model ready to run. Loading takes about 0.5 s per MB of the file on one core, because onnxruntime optimises the model.
 
     Arguments: `model`, the path of a file from `torchmembrane export`; `threads`, the number of onnxruntime's threads (1 is
         best for single frames); `providers`, those of onnxruntime, in order of preference.

@@ -125,8 +125,8 @@ def contact_law(sensor: Sensor, progress: Progress = silent) -> ContactLaw:
         MembraneError: the sensor cannot be simulated, or too few presses can be followed.
 
     Limitations:
-        Valid at the top for frictionless balls of radius 0.1 to 0.26 and depths up to 0.1 of the size. Nearer the rim, forces
-        are larger, and other bodies have other laws (the force of a plate grows faster).
+        Valid at the top for frictionless balls of radius 0.1 to 0.26 and depths up to 0.1 of the size. Away from the top,
+        forces are smaller, and other bodies have other laws (the force of a plate grows faster).
 
     Example:
         >>> from torchmembrane.presets import preset

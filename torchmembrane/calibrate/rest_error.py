@@ -61,7 +61,7 @@ def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tupl
         MembraneError: the surface folds either way.
     """
     right = 0 < share <= MOST_ERROR
-    expect(right, "calibrate material: rest error", share, f"more than 0, at most {MOST_ERROR:g}, of the height")
+    expect(right, "calibrate material: rest error", share, f"a share of the height, more than 0 and at most {MOST_ERROR:g}")
     for change in (-share, share):
         try:
             return changed_height(sensor, positions, change)

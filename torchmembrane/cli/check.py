@@ -63,7 +63,7 @@ def add_parser(commands: Any) -> None:
     add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also make a spec sheet of the sensor from simulated presses")
     add("--seed", type=seed, help="seed of presses and noise of --accuracy (default: 0)")
-    noise = "noise of images of --accuracy: ratio of white to its standard deviation (default: as in the rest image, else 40)"
+    noise = "image noise for --accuracy: ratio of white to its standard deviation (default: as in the rest image, else 40)"
     add("--noise", metavar="DB", type=number_from(0, MOST_DECIBEL), help=noise)
     add("--jobs", metavar="J", type=count, help="number of processes of --accuracy (default: one per core)")
 

@@ -18,7 +18,7 @@ examples:
 The input of the model is `image` [batch, 1, height, width], grey in 0..1. Its outputs are the arrays of a NAME.npz, one row
 per frame. With --tracking (for dots), it has a second input `previous_pixels`, the pixels of the dots in the preceding
 frames, or NaN to search for them from rest. The package torchmembrane-edge (folder export/) runs the model without torch. The
-command needs pip install "torchmembrane[export]"
+command needs pip install "torchmembrane[export]".
 
 exit code: 0 written, 2 wrong usage or sensor file"""
 

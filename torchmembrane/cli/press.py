@@ -138,7 +138,7 @@ def _refuse_lengths(arguments: Namespace, size: float) -> None:
         lengths = np.array([math.hypot(*given)]) if name in ("slide", "aim") else given
         if not ((lengths >= least * size) & (lengths <= most * size)).all():
             expected = f"{least * size:.3g} to {most * size:.3g}, as the surface's size is {size:.3g}"
-            raise MembraneError(f"--{name} {_listed(given)}: no press of this membrane; expected lengths from {expected}")
+            raise MembraneError(f"--{name} {_listed(given)}: not possible for this membrane; expected lengths from {expected}")
 
 
 def _stroke(arguments: Namespace, simulator: Simulator) -> Stroke:

@@ -76,7 +76,7 @@ def _add_work(add: Add) -> None:
     each = "number of processes, of one thread each; 1: only this process (default: one per core, if there are enough frames)"
     add("--workers", metavar="N", type=count, help=each)
     where = (
-        "on this machine (default), or on the Ray cluster of RAY_ADDRESS, which writes a Parquet dataset; see docs/clusters.md"
+        "compute on this machine (default), or on the Ray cluster of RAY_ADDRESS into a Parquet dataset; see docs/clusters.md"
     )
     add("--engine", choices=ENGINES, default=ENGINES[0], help=where)
     part = (

@@ -32,7 +32,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to; its file replaces `path` when the block ends without an error.
 
     An interrupted or failing block leaves `path` as it was. The path to write to is hidden (`.*.partial`), so that readers of a
-    folder pass over it, and short, so that it exists wherever `path` can; each process has its own. A symbolic link at `path`
+    folder pass over it, and short, so that it is valid wherever `path` is; each process has its own. A symbolic link at `path`
     is replaced, not followed.
 
     Args:

@@ -81,7 +81,7 @@ def pictures(image: Image.Image) -> Iterator[int]:
     gain maps.
 
     Raises:
-        MembraneError: the file declares pictures to which its directory does not lead.
+        MembraneError: the file declares more pictures than its directory lists.
         Exception: one of `DAMAGE`, if a picture cannot be located.
     """
     size, place, held = image.size, 0, 0

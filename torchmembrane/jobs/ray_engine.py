@@ -39,7 +39,7 @@ class RayEngine:
                 )
             paths.append(printable(str(source.file)))
         if work.figures:
-            raise MembraneError("--figures: --engine ray draws none; use `torchmembrane view DIR --frame NAME`")
+            raise MembraneError("--figures: --engine ray draws no figures; use `torchmembrane view DIR --frame NAME`")
         if paths:
             yield from self._outcomes(work.reconstructor, paths, batch)
 

@@ -57,7 +57,7 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
         distance = surface.membrane(FINE).ray_points(origin, direction).distance
         for missed in np.flatnonzero(~np.isfinite(distance)).tolist():
             row = rows[missed]
-            raise MembraneError(f"{row.where}: {','.join(row.cells)} misses the membrane; expected dots in its rim")
+            raise MembraneError(f"{row.where}: {','.join(row.cells)} misses the membrane; expected dots within its rim")
         positions = origin + distance[:, None] * direction
     return rounded(positions), sizes
 

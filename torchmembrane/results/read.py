@@ -87,7 +87,7 @@ def read_frame(path: str | Path, name: str | None = None) -> FoundFrame:
     first = min(frames, key=in_order)
     chosen = first if name is None else name
     if chosen not in frames:
-        raise MembraneError(f"{path}: no frame {chosen!r}; expected one of {len(frames)}, {first!r} the first")
+        raise MembraneError(f"{path}: no frame {chosen!r}; expected one of its {len(frames)} frames, such as {first!r}")
     return FoundFrame(chosen, frames[chosen], path.parent.parent if path.parent.name == "frames" else path.parent)
 
 

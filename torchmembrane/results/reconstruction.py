@@ -29,7 +29,7 @@ class TactileFields(NamedTuple):
 
     penetration_depth      [B, V]     `indentation`, zero where the membrane is not pushed in
     tactile_normal_force   [B, V]     compressive force on a vertex
-    tactile_shear_force    [B, V, 2]  along the camera's x turned into the rest surface, and along the normal times that
+    tactile_shear_force    [B, V, 2]  along the camera's x projected onto the rest surface, and along the normal times that
     """
 
     penetration_depth: Tensor
@@ -64,7 +64,7 @@ class Reconstruction(NamedTuple):
     contact_curvature [B, 4, 2]  principal curvatures of the surface in the patch (1 / length), the larger first, positive where
                                  the object bulges into the membrane; NaN where the patch is too narrow to tell
     contact_at_rim    [B, 4]     1 where the patch reaches the fixed rim, its force is then a lower bound; else 0
-    coverage          [B]        share of the membrane's area that found markers see, of what they see at rest
+    coverage          [B]        area around the markers found, over the area around those seen at rest
     camera_motion     [B, 4]     of the image against the rim, estimated and taken out: du, dv (px), rotation (degrees, u to v),
                                  scale, about the image's centre; `pixels` stay as measured
     force_deviation   [B, 3]     standard deviation of `force`, with the model's error in it; NaN where no tractions are found

@@ -125,9 +125,9 @@ def _views_options(add: Add) -> None:
         "views one image of each, NAME_VIEW, or the image whose regions they are",
     )
     where = (
-        "CSV x,y,z,turn_x,turn_y,turn_z: approximate pose of the camera for each image, in its first frame; rotation in degrees"
+        "CSV x,y,z,turn_x,turn_y,turn_z: approximate pose of the camera for each image, relative to that of the first image; "
+        "rotation in degrees; not for a sensor with several views, whose file contains the poses"
     )
-    where += "; not for a sensor with several views, whose file contains the poses"
     add("--motions", metavar="FILE.csv", type=Path, help=where)
     scale = "standard deviation of the second camera's distance from the first, which sets the scale, in the sensor's unit"
     scale += " (default: 0.01 mm)"

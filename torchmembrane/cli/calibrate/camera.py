@@ -24,7 +24,7 @@ def camera(arguments: Namespace) -> int:
     try:
         refuse_folds(found.camera, sensor.membrane.rest)
     except MembraneError as error:
-        raise MembraneError(f"calibrate camera: of the lens found {error}") from error
+        raise MembraneError(f"calibrate camera: the lens that was found is refused: {error}") from error
     units = [{"focal": "px", "centre": "px"}.get(name.split("[")[0], "") for name in found.names]
     return _write(arguments, whole, number, found, pixels, units, f"lens: {sensor.camera.model}, {len(pixels)} images")
 

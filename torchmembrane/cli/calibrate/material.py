@@ -105,7 +105,7 @@ def _doubted(sensor: Sensor, images: torch.Tensor, paths: list[Path]) -> list[st
 
 
 def known_forces(arguments: Namespace, inputs: Inputs) -> KnownForces | None:
-    """Those of the table, and in images without one the weight; None without either.
+    """Return the forces of the table, and the weight for images that it does not list; None if neither is given.
 
     Args:
         arguments: `forces`, a table, and `weight`, N.

@@ -1,7 +1,8 @@
 """Residuals of markers at a distance from the surface: the angles of their tips, which turn with the surface under them.
 
 A tip `x + h n` depends on three fields: the displacement of the surface, and its derivatives along the grid's two directions,
-which turn the tangents. With the dual basis `a*, b*` of the tangents and the Jacobian `J` of the angles in the tip's position
+which turn the tangents. With the dual basis `a*, b*` of the tangents and the Jacobian `J` of the angles with respect to the
+position of the tip, the angles change by
 
     dr = J dx - h (J a*) (n . da) - h (J b*) (n . db),
 

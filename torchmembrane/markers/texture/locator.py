@@ -128,7 +128,9 @@ class TextureLocator(PatchLocator):
 
     @traced
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
-        """Locate the patches in a batch of frames; the gradient takes the last level only, the rest is where to look.
+        """Locate the patches in a batch of frames; only the steps on the finest level are differentiated.
+
+        The coarser levels only determine where these steps start.
 
         Args:
             image: `[B, 1, H, W]`, grey in 0..1, of the rest image's size.
