@@ -8,6 +8,8 @@ from bench.measure.accuracy_tables import Rows, percent
 
 WRONG = 0.25
 """Error over the press from which a result is wrong."""
+LOST = 1000
+"""Relative growth of an error from which no surface is left."""
 
 
 def drift(found: dict) -> Rows:
@@ -125,13 +127,13 @@ def mismatched(found: dict) -> Rows:
 
 
 def growth(of: list[float | None]) -> str:
-    """Median, worst, and how many draws grow by more than a fifth; None: no surface.
+    """Median, worst, and how many draws grow by more than a fifth; None, or a growth of `LOST` and more: no surface.
 
     >>> growth([7.92, None, 67])
     '792 %, no surface, 67'
     """
     middle, worst, count = of
-    return f"{middle:.0%}, {'no surface' if worst is None else f'{worst:.0%}'}, {count}".replace("%", " %")
+    return f"{middle:.0%}, {'no surface' if worst is None or worst > LOST else f'{worst:.0%}'}, {count}".replace("%", " %")
 
 
 def mismatched_summary(results: dict) -> dict:
