@@ -83,8 +83,8 @@ def readme_range(found: dict) -> str:
     (of, deep), every = by_depth(found), round(1 / found["groups"][0]["wrong"])
     return (
         f"Of the presses of random sensors that are up to a fifth of the membrane's size deep, {of['right']} % are right, "
-        f"{of['ok']} % with status `ok`. Nearly all deeper presses get status 9, out of range; of those up to 0.3 of the size "
-        f"{deep['right']} % are right. Of all presses, one in {every} is wrong although its status is `ok`."
+        f"{of['ok']} % with status `ok`. Nearly all deeper presses get another status, mostly 9 (out of range); of those up to "
+        f"0.3 of the size {deep['right']} % are right. Of all presses, one in {every} is wrong although its status is `ok`."
     )
 
 
@@ -100,8 +100,8 @@ def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights:
         [
             "depth",
             f"presses up to a fifth of the membrane's size: {of['right']} % are right; from there to 0.3: "
-            f"{deep['right']} %, nearly all with status 9. {of['wrong']} % and {percent(unnoticed)} are wrong with "
-            "status ok",
+            f"{deep['right']} %, nearly all with another status, mostly 9. {of['wrong']} % and {percent(unnoticed)} are wrong "
+            "with status ok",
             "[range](force_balance.md#range), [status 9](#range)",
         ],
         [
