@@ -128,6 +128,8 @@ def drifts(part, **of):
 
 
 PRESS = dict(kind="press", width=2.0, at_rim=False, surface=0.1, force=0.1)
+ABOUT = dict(filling="gas", prestretch=1.05, dots=90, markers="dots", seen=1.0, clear=0.3)
+THREE = (0, 0.01, 0.1), (0, 0.15, 0.9), (9, 0.25, 0.1)  # status, depth and error: right, wrong with ok, right with a status
 RAW = {
     "drift": dict(
         rows=[dict(part="noise", frames=20100, alarms=0, certainty=-2.5), dict(part="touch", said=False)]
@@ -157,6 +159,7 @@ RAW = {
     ),
     "fuzz": dict(videos=dict(cases=100, kinds={"refused": 3, "decoded": 97}, broken=[], slowest=0.1, largest_MB=12)),
     "pins": dict(presses=[dict(height=h, file=f, status=0, surface=0.3, force=0.01) for h in (0, 4) for f in PINS]),
+    "range": dict(rows=[PRESS | ABOUT | dict(status=status, depth=depth, surface=off) for status, depth, off in THREE]),
     "out-of-range": dict(rows=[PRESS | dict(depth=depth, status=status) for depth, status in ((0.15, 0), (0.25, 9))]),
     "knocked": dict(
         presses=[
@@ -184,6 +187,7 @@ SAID = {
     "crash-npz": ("each time | 0.2 s", "500 identical"),
     "fuzz": ("| videos | 100 | 3 | 97 | 0 | 0.1 s | 12 MB |",),
     "pins": ("0 (painted)", "| 4 mm | tips taken for dots | 0.3 / 0.3 | 0.01 / 0.01 | 1 of 1 | 1 |"),
+    "range": ("| all | 3 | 0.333 | 0.333 | 0.333 |", "| 0.2 to 0.3 | 1 | 0.00 | 1.00 | 0.00 |"),
     "out-of-range": ("| 0.1 to 0.18 | 0 of 1 | 0 of 0 |", "| 0.2 to 0.3 | 1 of 1 | 0 of 0 |"),
     "knocked": ("| 5.0 / 5.0 | 5.0 / 5.0 |", "| 1 of 1 | 0 of 1 |", "| 0.020 / 0.020 |", "| 1, 0 | 1, 0 |", "| 1 | 1 |"),
     "weight": ("3 of 4", "1.05 to 1.05", "5.0 %", "all: 20 forces"),

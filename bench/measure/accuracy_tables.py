@@ -223,10 +223,10 @@ def knocked_summary(results: dict) -> dict:
 def working_range(found: dict) -> Rows:
     """Shares of presses that are right and wrong with status ok, by what the sensor and the press are like."""
     rows = [
-        [row["name"], str(row["presses"]), *(f"{row[key]:.{row['digits']}f}" for key in ("right", "wrong"))]
+        [row["name"], str(row["presses"]), *(f"{row[key]:.{row['digits']}f}" for key in ("right", "cautious", "wrong"))]
         for row in found["groups"]
     ]
-    return [["", "presses", "right, status ok", "wrong, status ok"], *rows]
+    return [["", "presses", "right, status ok", "right, another status", "wrong, status ok"], *rows]
 
 
 GROUPS = {
@@ -252,7 +252,7 @@ GROUPS = {
 
 def range_summary(results: dict) -> dict:
     """Shares right and wrong of the presses of every group, from one row a press."""
-    from bench.accuracy.range import verdict
+    from bench.accuracy.range import is_right, verdict
 
     presses = [row for row in results["rows"] if row["kind"] == "press"]
     wide, narrow = ([row for row in presses if (row["width"] >= 1) == is_wide] for is_wide in (True, False))
@@ -266,7 +266,9 @@ def range_summary(results: dict) -> dict:
     found = []
     for name, chosen in groups:
         verdicts = [verdict(row) for row in chosen]
-        shares = {key: verdicts.count(key) / max(len(chosen), 1) for key in ("right", "wrong")}
+        counts = {key: verdicts.count(key) for key in ("right", "wrong")}
+        counts["cautious"] = sum(row["status"] != 0 and is_right(row) for row in chosen)
+        shares = {key: count / max(len(chosen), 1) for key, count in counts.items()}
         found.append(dict(name=name, presses=len(chosen), digits=3 if name == "all" else 2, **shares))
     return dict(groups=found)
 

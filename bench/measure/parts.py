@@ -24,7 +24,7 @@ MADE = {
     "light": (f"{RANDOM_SENSORS} --sensors 20 --presses 0 --light 54 --seed 2026",),
     "gauge": (f"{RANDOM_SENSORS} --sensors 14 --presses 2 --light 8",),
     "intervals": tuple(f"{RANDOM_SENSORS}/{seed} --sensors 40 --presses 2 --light 6 --seed {seed}" for seed in SEEDS),
-    "range": (f"{RANDOM_SENSORS} --sensors 240 --presses 4 --seed 8126",),
+    "range": (f"{RANDOM_SENSORS} --sensors 160 --presses 4 --seed 8126",),
     "out-of-range": tuple(f"{RANDOM_SENSORS}/{name} --sensors {number} {of}" for name, number, of in OTHERS),
     "degraded-images": (f"{RANDOM_SENSORS} --sensors 15",),
     "precision": (),

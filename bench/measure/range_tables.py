@@ -64,22 +64,27 @@ def out_of_range_summary(results: dict) -> dict:
     return dict(bands=bands)
 
 
-def by_depth(found: dict) -> tuple[dict[str, int], dict]:
-    """Shares right and wrong with status ok, %, of presses up to a fifth of the size deep; and the group of the deeper ones."""
+def by_depth(found: dict) -> tuple[dict[str, int], dict[str, int]]:
+    """Of presses up to a fifth of the size deep, and of deeper ones: %, right with any status, right with ok, wrong with ok."""
     groups = found["groups"]
     first = next(k for k, row in enumerate(groups) if row["name"] == "depth up to 0.05")
-    shallow, deep = groups[first : first + 3], groups[first + 3]
-    presses = sum(row["presses"] for row in shallow)
-    return {key: round(100 * sum(row["presses"] * row[key] for row in shallow) / presses) for key in ("right", "wrong")}, deep
+    parts = []
+    for chosen in (groups[first : first + 3], groups[first + 3 : first + 4]):
+        presses = sum(row["presses"] for row in chosen)
+        ok, cautious, wrong = (
+            sum(row["presses"] * row[key] for row in chosen) / presses for key in ("right", "cautious", "wrong")
+        )
+        parts.append({key: round(100 * share) for key, share in (("right", ok + cautious), ("ok", ok), ("wrong", wrong))})
+    return parts[0], parts[1]
 
 
 def readme_range(found: dict) -> str:
     """A paragraph on how deep a press may be."""
     (of, deep), every = by_depth(found), round(1 / found["groups"][0]["wrong"])
     return (
-        f"The results are not reliable for presses deeper than a fifth of the membrane's size: up to that depth "
-        f"{of['right']} % are right, from there to 0.3 of the size {percent(deep['right'])}, "
-        f"and of all presses one in {every} is wrong although its status is `ok`."
+        f"Of the presses of random sensors that are up to a fifth of the membrane's size deep, {of['right']} % are right, "
+        f"{of['ok']} % with status `ok`. Nearly all deeper presses get another status, mostly 9 (out of range); of those up to "
+        f"0.3 of the size {deep['right']} % are right. Of all presses, one in {every} is wrong although its status is `ok`."
     )
 
 
@@ -95,8 +100,8 @@ def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights:
         [
             "depth",
             f"presses up to a fifth of the membrane's size: {of['right']} % are right; from there to 0.3: "
-            f"{percent(deep['right'])}, nearly all with status 9. {of['wrong']} % and {percent(unnoticed)} are wrong with "
-            "status ok",
+            f"{deep['right']} %, nearly all with another status, mostly 9. {of['wrong']} % and {percent(unnoticed)} are wrong "
+            "with status ok",
             "[range](force_balance.md#range), [status 9](#range)",
         ],
         [
