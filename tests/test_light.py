@@ -10,8 +10,10 @@ from test_force_balance import pressed as pressed
 
 from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
+from torchmembrane.errors import MembraneError
 from torchmembrane.estimators.force_balance import traction_loss
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
+from torchmembrane.estimators.force_balance.robust import GemanMcClure
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
@@ -87,6 +89,22 @@ def test_nothing_is_a_push_that_the_noise_makes_by_itself():
     level = SETTINGS.noise_share * loss.push_noise[patch].mean()
     far_below, at_noise, above = (normal_weights(estimator, share * level * force)[patch] for share in (0.01, 0.5, 10.0))
     assert (at_noise > 0.25 * far_below).all() and (above.median() < 0.01 * far_below.median())
+
+
+@pytest.mark.parametrize("changes", [{}, dict(floor=0.02), dict(contact_noise=5.0)])
+def test_the_smallest_push_of_a_contact_has_the_weight_of_the_floor_beside_noise(changes):
+    """With the scale that the noise alone gives: a little less is no contact and weighs more, a little more weighs less."""
+    settings, noise = replace(SETTINGS, **changes), 0.01
+    scale = settings.noise_share * noise / settings.tau[1]
+    smallest = settings.contact_noise * noise / scale
+    weights = [float(GemanMcClure(settings.tau[1]).weight(torch.tensor(share * smallest) ** 2)) for share in (0.9, 1, 1.1)]
+    assert weights[0] > 1.1 * settings.floor > 1.1 * weights[2] and weights[1] == pytest.approx(settings.floor, rel=1e-5)
+
+
+@pytest.mark.parametrize("floor", [0.0, 1.0, -1e-3])
+def test_a_floor_that_is_no_share_is_refused(floor):
+    with pytest.raises(MembraneError, match=f"floor = {floor}; expected more than 0 and less than 1"):
+        replace(SETTINGS, floor=floor)
 
 
 @pytest.mark.parametrize("options", [{}, dict(filling="open"), dict(filling="gas", gas=(0.1, 2600.0))])
