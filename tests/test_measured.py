@@ -10,7 +10,7 @@ import pytest
 from bench.measure import measure, pages
 from bench.measure.calibration_tables import WEIGHED
 from bench.measure.parts import PARTS, Part, words
-from bench.measure.range_tables import PINS
+from bench.measure.range_tables import PINS, readme_range
 from bench.measure.tables import FIGURES, SUMMARIES, TABLES
 
 IDENTITY = ("-c", "user.name=A", "-c", "user.email=a@b.c")
@@ -151,6 +151,7 @@ RAW = {
     ),
     "degraded-images": dict(
         rows=[dict(way=way, status=status, surface=9.0) for way, status in (("clean", 0), ("mirrored", 0), ("a hair", 7))]
+        + [dict(way="a stick", status=8, surface=0.1)]
     ),
     "crash-npz": dict(
         kills=[dict(signal=name, before=at, kept=at + 5, lost=0.25) for name, at in (("SIGTERM", 0), ("SIGKILL", 5))],
@@ -183,7 +184,11 @@ SAID = {
     "mistakes": ("| none | 1 | 0 | 1 |", "| 1 | 1 | 0 |"),
     "mismatched": ("no surface, 2", "0.450"),
     "life": ("1 of 2 lives", "4000 presses", "9 %", "2 %"),
-    "degraded-images": ("| images | 2 |", "mirrored or upside down, which cannot be noticed for a symmetric pattern | 1 |"),
+    "degraded-images": (
+        "| images | 3 |",
+        "off by less than a quarter of the press | 1 |",
+        "mirrored or upside down, which cannot be noticed for a symmetric pattern | 1 |",
+    ),
     "crash-npz": ("each time | 0.2 s", "500 identical"),
     "fuzz": ("| videos | 100 | 3 | 97 | 0 | 0.1 s | 12 MB |",),
     "pins": ("0 (painted)", "| 4 mm | tips taken for dots | 0.3 / 0.3 | 0.01 / 0.01 | 1 of 1 | 1 |"),
@@ -202,3 +207,10 @@ def test_what_a_benchmark_writes_gives_its_table(part):
     made = make(*[SUMMARIES[part](RAW[part])] * len(parts))
     text = made if isinstance(made, str) else pages.markdown(made)
     assert not [each for each in SAID[part] if each not in text], text
+
+
+def test_the_paragraph_on_the_range_counts_right_presses_with_any_status():
+    """Of two shallow presses one is right; the deep one is right and out of range; of all three one is wrong with ok."""
+    said = readme_range(SUMMARIES["range"](RAW["range"]))
+    assert "50 % are right, 50 % with status `ok`" in said
+    assert "0.3 of the size 100 % are right" in said and "one in 3 is wrong" in said

@@ -8,8 +8,8 @@ from bench.measure.accuracy_tables import Rows, percent
 
 WRONG = 0.25
 """Error over the press from which a result is wrong."""
-LOST = 1000
-"""Relative growth of an error from which no surface is left."""
+LARGEST_GROWTH = 1000
+"""Relative growth of an error above which its number says nothing more."""
 
 
 def drift(found: dict) -> Rows:
@@ -127,13 +127,17 @@ def mismatched(found: dict) -> Rows:
 
 
 def growth(of: list[float | None]) -> str:
-    """Median, worst, and how many draws grow by more than a fifth; None, or a growth of `LOST` and more: no surface.
+    """Median, worst, and how many draws grow by more than a fifth; None: no surface.
 
-    >>> growth([7.92, None, 67])
-    '792 %, no surface, 67'
+    >>> growth([7.92, None, 67]), growth([7.14, 3e8, 67])
+    ('792 %, no surface, 67', '714 %, over 100000 %, 67')
     """
     middle, worst, count = of
-    return f"{middle:.0%}, {'no surface' if worst is None or worst > LOST else f'{worst:.0%}'}, {count}".replace("%", " %")
+    if worst is None:
+        most = "no surface"
+    else:
+        most = f"over {LARGEST_GROWTH:.0%}" if worst > LARGEST_GROWTH else f"{worst:.0%}"
+    return f"{middle:.0%}, {most}, {count}".replace("%", " %")
 
 
 def mismatched_summary(results: dict) -> dict:
