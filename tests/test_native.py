@@ -19,7 +19,7 @@ from torchmembrane.estimators.force_balance.kernels import steps as native
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.uncertainty import spreads_by_tensors
-from torchmembrane.machine_code import aligned, kept, takes, using
+from torchmembrane.machine_code import kept, takes, using
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.solve import native_band
 from torchmembrane.surface.membrane import Membrane
@@ -28,7 +28,7 @@ from torchmembrane.surface.shapes import spherical_cap
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
 PACKAGE = Path(native.__file__).parents[3]
 LOADS = 8
-factor, backward = (numba.njit(function.py_func) for function in (native_band.factor, native_band.backward))
+factor_rows, backward = (numba.njit(function.py_func) for function in (native_band.factor_rows, native_band.backward))
 
 
 def estimator(model="neo_hookean", prestretch=1.3, filling="liquid", grid=(11, 9), hole=False):
@@ -322,44 +322,49 @@ def test_what_needs_tensor_operations_is_left_to_them():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("unknowns, width", [(5, 3), (16, 7), (50, 20), (147, 50), (675, 98)])
 def test_a_band_is_factored_and_solved_as_the_dense_matrix(unknowns, width, dtype):
-    matrix, U, sizes = band(unknowns, width, dtype)
-    size, ld = sizes
-    b = aligned(LOADS * size, np.dtype(dtype))
-    loads = np.random.default_rng(1).normal(size=(LOADS, unknowns))
-    b.reshape(-1, size)[:, :unknowns] = loads
-    inverse, panel = np.zeros(size, dtype), np.zeros(native_band.RANK * ld, dtype)
-    assert factor(U, ld, width, size, inverse, panel, b, LOADS)
-    exact = np.linalg.solve(matrix, loads.T)
+    matrix, U, (size, stride) = band(unknowns, width, dtype)
+    y = np.zeros((size, native_band.COLUMNS), dtype)
+    loads = np.random.default_rng(1).normal(size=(unknowns, LOADS))
+    y[:unknowns, :LOADS] = loads
+    inverse = np.zeros(size, dtype)
+    assert is_factored(U, stride, width, inverse, y)
+    exact = np.linalg.solve(matrix, loads)
     tolerance = 1e3 * np.finfo(dtype).eps
-    y = b.reshape(-1, size)[:, :unknowns].astype(float)
-    np.testing.assert_allclose(y @ y.T, loads @ exact, rtol=0, atol=tolerance * abs(loads @ exact).max())
-    first = b[:size]
-    backward(U, ld, width, size, inverse, first)
+    half = y[:unknowns, :LOADS].astype(float)
+    np.testing.assert_allclose(half.T @ half, loads.T @ exact, rtol=0, atol=tolerance * abs(loads.T @ exact).max())
+    first = y[:, 0].copy()
+    backward(U, stride, width, inverse, first)
     np.testing.assert_allclose(first[:unknowns], exact[:, 0], rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("row", [0, 1, 30, 49])
 @pytest.mark.parametrize("spoil", [-1.0, np.nan])
 def test_a_band_that_is_not_positive_has_no_factor(row, spoil):
-    _, U, (size, ld) = band(50, 20, np.float64)
-    U[row * ld + row % native_band.LANES] = spoil
-    b = aligned(LOADS * size, np.dtype(float))
-    assert not factor(U, ld, 20, size, np.zeros(size), np.zeros(native_band.RANK * ld), b, LOADS)
+    _, U, (size, stride) = band(50, 20, np.float64)
+    U[native_band.PAD + row * (stride + 1)] = spoil
+    assert not is_factored(U, stride, 20, np.zeros(size), np.zeros((size, native_band.COLUMNS)))
+
+
+def is_factored(U, stride, width, inverse, y):
+    """Whether all rows of `U` become those of its factor."""
+    work = np.zeros(native_band.ROWS**2, U.dtype)
+    rows = range(0, len(inverse), native_band.ROWS)
+    return all(factor_rows(U, stride, width, first, inverse, y.reshape(-1), LOADS, work) for first in rows)
 
 
 def band(unknowns, width, dtype):
     """A random positive matrix, dense, and as `native_band` stores it."""
-    size, rows, ld = native_band.storage(unknowns, width)
+    size, stride = native_band.storage(unknowns, width)
     generator = np.random.default_rng(0)
-    matrix, stored = np.zeros((unknowns, unknowns)), aligned(rows * ld, np.dtype(dtype))
+    matrix, stored = np.zeros((unknowns, unknowns)), native_band.matrix(size, stride, np.dtype(dtype))
     for r in range(size):
         values = generator.normal(size=min(width + 1, max(unknowns - r, 1))) / (4 * width)
         values[0] = 1.0
-        at = r * ld + r % native_band.LANES
+        at = native_band.PAD + r * (stride + 1)
         stored[at : at + len(values)] = values
         if r < unknowns:
             matrix[r, r : r + len(values)] = matrix[r : r + len(values), r] = values
-    return matrix, stored, (size, ld)
+    return matrix, stored, (size, stride)
 
 
 def test_what_can_be_kept_nowhere_is_compiled_all_the_same():

@@ -12,7 +12,7 @@ import numpy as np
 from ....machine_code import aligned, compiled
 from ....mechanics.native_membrane import STENCIL, Surface
 from ....solve.band import RIDGES
-from ....solve.native_band import LANES, RANK, ROWS, storage
+from ....solve.native_band import COLUMNS, PAD, ROWS, matrix, storage
 from ....solve.native_rows import sum_rows
 from ....solve.stencil_layouts import OFFSETS
 from ..robust import geman_mcclure_curvature, geman_mcclure_weight
@@ -107,32 +107,33 @@ class Workspace(NamedTuple):
     jacobians: Any
     marker_weights: Any
     U: Any
-    """The matrix, and `inverse [3 N]`, `panel` and its `scale [3 N]`, as `native_band` stores them."""
+    """The matrix, and `inverse [3 N]` and its `scale [3 N]`, as `native_band` stores them."""
     inverse: Any
-    panel: Any
     scale: Any
     loads: Any
     """`[11, 3 N]`"""
     y: Any
-    """`[12 x 3 N]`, loads, and then what `native_band` makes of them; the last zero."""
+    """`[3 N x COLUMNS]`, loads, and then what `native_band` makes of them."""
+    solved: Any
+    """`[3 N]`, a sum of them."""
     ridges: Any
     """`band.RIDGES`: a loop over an array is compiled once, over a tuple once for each of its numbers."""
     width: int
-    """Diagonals of the matrix above the main one."""
+    """Diagonals of the matrix above the main one; `stride`: as in `native_band`."""
+    stride: int
 
 
 def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     """Return the arrays for a grid and a number of markers."""
     m, n = grid
     N, V, width = (m - 2) * (n - 2), m * n, 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
-    unknowns, rows, ld = storage(3 * N, width)
+    size, stride = storage(3 * N, width)
     shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, V), W=(3, 3, V), of_loads=(3, 2, V))
     shapes |= dict(sums=(90, V), normal=(N, 3), fields=(5, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
-    shapes |= dict(marker_weights=(markers,), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
+    shapes |= dict(marker_weights=(markers,), inverse=(size,), scale=(size,), solved=(size,), loads=(LOADS, size))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
-    y = aligned(-(-LOADS // ROWS) * ROWS * unknowns, dtype)
-    arrays |= dict(ridges=np.array(RIDGES, dtype))
-    return Workspace(U=aligned(rows * ld, dtype), y=y, loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
+    arrays |= dict(U=matrix(size, stride, dtype), y=aligned(size * COLUMNS, dtype), ridges=np.array(RIDGES, dtype))
+    return Workspace(width=width, stride=stride, **arrays)
 
 
 @compiled
@@ -266,31 +267,35 @@ def sum_blocks(c, work):
 
 
 @compiled
-def fill(c, work, damping, ridge, used):
-    """Write the matrix of the blocks to `U` and the first loads to `y`, scaled by `scale` to a diagonal of 1, with the ridge
-    added."""
-    (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
-    ld, size = len(work.panel) // RANK, len(work.scale)
-    scale[:], U[:] = 1, 0
+def scale_rows(c, work, damping):
+    """Compute the `scale` that makes the matrix's diagonal 1."""
+    (m, n), sums, scale = c.surface.free.shape, work.sums, work.scale
+    scale[:] = 1
     for k in range((m - 2) * (n - 2)):
         at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
         for a in range(3):
             if sums[4 * a, at] > 0:
                 scale[3 * k + a] = 1 / np.sqrt(sums[4 * a, at] * (1 + damping))
-    for i in range(m - 2):
-        for j in range(n - 2):
-            k, at = i * (n - 2) + j, (i + 1) * n + j + 1
+
+
+@compiled
+def write_rows(c, work, first, ridge, used):
+    """Write `ROWS` rows of the matrix of the blocks to `U`, and of the first `used` loads to `y`, scaled by `scale`, with the
+    ridge added."""
+    (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
+    stride, inner = work.stride, n - 2
+    U[first * (stride + 1) + 1 : (first + ROWS) * (stride + 1) + 1] = 0
+    for r in range(first, first + ROWS):
+        start, k, a = PAD + r * stride, r // 3, r % 3
+        i, j = k // inner, k % inner
+        if i < m - 2:
+            at = (i + 1) * n + j + 1
             for block in range(10):
                 p, q = i + OFFSETS[block][0], j + OFFSETS[block][1]
-                if p < m - 2 and 0 <= q < n - 2:
-                    column = 3 * (p * (n - 2) + q)
-                    for a in range(3):
-                        r = 3 * k + a
-                        start = r * ld - r // LANES * LANES + column
-                        for b in range(a if block == 0 else 0, 3):
-                            U[start + b] = sums[9 * block + 3 * a + b, at] * scale[r] * scale[column + b]
-    for r in range(size):
-        U[r * ld + r % LANES] = 1 + ridge
-    for load in range(used):
-        for r in range(size):
-            work.y[load * size + r] = work.loads[load, r] * scale[r]
+                if p < m - 2 and 0 <= q < inner:
+                    column = 3 * (p * inner + q)
+                    for b in range(3):
+                        U[start + column + b] = sums[9 * block + 3 * a + b, at] * scale[r] * scale[column + b]
+        U[start + r] = 1 + ridge
+        for load in range(used):
+            work.y[r * COLUMNS + load] = work.loads[load, r] * scale[r]

@@ -9,16 +9,18 @@ import numpy as np
 from ....machine_code import compiled
 from ....mechanics.cavity import gas_law_step
 from ....mechanics.native_membrane import linearise
-from ....solve.native_band import RANK, ROWS, backward, factor
+from ....solve.native_band import COLUMNS, ROWS, VECTOR, backward, factor_rows, subtract_products
 from ....solve.symmetric_2x2 import symmetric_solution
 from ..camera_motion import camera_stiffness
 from ..schedule import LEAST_MOVE, SETTLING_DAMPING, falling, outlier_scale, scaled_step
-from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, sum_blocks, weigh
+from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, load_forces, scale_rows, sum_blocks, weigh, write_rows
 from .markers import load_markers
 from .solution import OBJECTIVE, TOLD, solution_of
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
 ratio_of_tau, scale_of_outliers, scaled = compiled(falling), compiled(outlier_scale), compiled(scaled_step)
+PART = 64
+"""Number of rows whose products are summed in single precision; their sums are added in double precision."""
 
 
 @compiled
@@ -75,19 +77,16 @@ def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, damping):
     fWv, vWv = load_forces(c, work)
     load_markers(c, work, u, moved, seen, outlier, own, slope)
     sum_blocks(c, work)
-    size, y = len(work.scale), work.y
     products = factored(c, work, damping, np.intp(WANTED))
     following = _camera_eliminated(c.numbers, products, own, slope, moved, tau)
     multiplier, one, change = _shares(c.numbers, products, rise, pressure[0], fWv, vWv, gauge)
-    solved, turn = y[:size], np.empty_like(moved)
-    for i in range(size):
-        solved[i] = multiplier * y[i] + one * y[size + i] + change * y[2 * size + i]
+    shares, turn = np.zeros(WANTED, u.dtype), np.empty_like(moved)
+    shares[VOLUME], shares[FORCES], shares[FLUID] = multiplier, one, change
     for a in range(4):
         turn[a] = multiplier * following[a, 0] + one * following[a, 1] + change * following[a, 2]
-        for i in range(size):
-            solved[i] += turn[a] * y[(3 + a) * size + i]
-    substituted(work, solved)
-    move = solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
+        shares[CAMERA + a] = turn[a]
+    substituted(work, shares)
+    move = work.solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
     share = _share(c, u, move)
     for i in range(m - 2):
         for j in range(n - 2):
@@ -100,31 +99,51 @@ def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, damping):
 
 @compiled
 def factored(c, work, damping, used):
-    """Factor the matrix; write `U^-T b` to `y` for all loads `b`, and return their products `b . M^-1 b'`, `[LOADS, LOADS]`."""
-    width, size, y = work.width, len(work.scale), work.y
-    tried, found = 0, False
+    """Factor the matrix; write `U^-T b` to `y` for the first `used` loads `b`, and return the products `b . M^-1 b'` of all,
+    `[COLUMNS, COLUMNS]`."""
+    scale_rows(c, work, damping)
+    R, tried, found = np.empty(ROWS * ROWS, work.U.dtype), 0, False
     while not found and tried < len(work.ridges):
-        fill(c, work, damping, work.ridges[tried], used)
-        found = factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y, -(-used // ROWS) * ROWS)
+        first, found = 0, True
+        while found and first < len(work.scale):
+            write_rows(c, work, first, work.ridges[tried], used)
+            found = factor_rows(work.U, work.stride, work.width, first, work.inverse, work.y, used, R)
+            first += ROWS
         tried += 1
     if not found:
-        y[:] = np.nan
-    products = np.zeros((LOADS, LOADS))
-    for a in range(used):
-        for b in range(a + 1):
-            total = 0.0
-            for i in range(size):
-                total += y[a * size + i] * y[b * size + i]
-            products[a, b] = products[b, a] = total
+        work.y[:] = np.nan
+    return _products(work.y, used)
+
+
+@compiled
+def _products(y, used):
+    """Return the products of the first `used` columns of `y [3 N, COLUMNS]`, `[COLUMNS, COLUMNS]`. Those of `PART` rows are
+    summed at a time."""
+    products, lanes = np.zeros((COLUMNS, COLUMNS)), VECTOR // y.itemsize
+    part, rows = np.empty(COLUMNS * COLUMNS, y.dtype), len(y) // COLUMNS
+    for first in range(0, rows, PART):
+        part[:] = 0
+        count, at = min(PART, rows - first), first * COLUMNS
+        for a in range(0, used, ROWS):
+            for b in range(0, used, lanes):
+                subtract_products(part, a * COLUMNS + b, COLUMNS, y, at + a, COLUMNS, y, at + b, COLUMNS, count)
+        for a in range(used):
+            for b in range(used):
+                products[a, b] -= part[a * COLUMNS + b]
     return products
 
 
 @compiled
-def substituted(work, solved):
-    """Turn a sum `[3 N]` of the vectors that `factored` wrote to `y` into the solution for that sum of loads."""
-    backward(work.U, len(work.panel) // RANK, work.width, len(work.scale), work.inverse, solved)
+def substituted(work, shares):
+    """Write to `solved` the solution for a sum of loads, of which `factored` wrote `U^-T b` to `y`, with these shares."""
     for i in range(len(work.scale)):
-        solved[i] *= work.scale[i]
+        total = shares[0] * work.y[i * COLUMNS]
+        for load in range(1, len(shares)):
+            total += shares[load] * work.y[i * COLUMNS + load]
+        work.solved[i] = total
+    backward(work.U, work.stride, work.width, work.inverse, work.solved)
+    for i in range(len(work.scale)):
+        work.solved[i] *= work.scale[i]
 
 
 @compiled

@@ -16,7 +16,7 @@ from .markers import load_markers
 @compiled
 def spread_of(c, work, u, pressure, moved, seen, noise_level, gauge, outlier, damping, found):
     """Return the standard deviations `[4]` at the state of a frame, with the scale `outlier` of the markers' loss."""
-    own, slope, size = np.zeros((4, 4)), np.zeros(4), len(work.scale)
+    own, slope, shares = np.zeros((4, 4)), np.zeros(4), np.zeros(LOADS, u.dtype)
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
     weigh(c, work, noise_level, c.numbers.last_tau, np.bool_(True))
     vWv = load_forces(c, work)[1] + gauge[1]
@@ -27,20 +27,18 @@ def spread_of(c, work, u, pressure, moved, seen, noise_level, gauge, outlier, da
     for a in range(4):
         own[a, a] += stiffness_at(c.numbers, moved, c.numbers.last_tau)
     following = _camera_eased(products, own)
-    compliance, solved = cavity_condition(c.numbers, rise, pressure[0])[1], np.empty(size, u.dtype)
+    compliance = cavity_condition(c.numbers, rise, pressure[0])[1]
     for k in range(WANTED, LOADS):
         multiplier, change = 0.0, 0.0
         if not c.numbers.is_open:
             loads = by_pressure[k - WANTED] - products[FLUID, k], -products[VOLUME, k]
             multiplier, change = border_unknowns(products, vWv, compliance, *loads)
-        for i in range(size):
-            solved[i] = work.y[k * size + i] - multiplier * work.y[VOLUME * size + i] - change * work.y[FLUID * size + i]
+        shares[:] = 0
+        shares[k], shares[VOLUME], shares[FLUID] = 1, -multiplier, -change
         for e in range(4):
-            share = following[e, k] - multiplier * following[e, VOLUME] - change * following[e, FLUID]
-            for i in range(size):
-                solved[i] += share * work.y[(CAMERA + e) * size + i]
-        substituted(work, solved)
-        found[k - WANTED] = np.sqrt(_at_markers(c, work, solved, own, seen[3]) + change**2 * gauge[1])
+            shares[CAMERA + e] = following[e, k] - multiplier * following[e, VOLUME] - change * following[e, FLUID]
+        substituted(work, shares)
+        found[k - WANTED] = np.sqrt(_at_markers(c, work, work.solved, own, seen[3]) + change**2 * gauge[1])
 
 
 @compiled
