@@ -75,6 +75,9 @@ To keep compilation fast, pass constant arguments as `np.intp(4)` or `np.bool_(T
 each literal, and let loops that need not be unrolled take their length from an array.
 """
 
+inlined = numba.njit(forceinline=True, **OPTIONS, **INNER)
+"""The same for a short function of loops over vectors, whose call would take as long as its loop."""
+
 
 def kept(function: Callable[..., Any]) -> Any:
     """Decorate a function so that it is compiled and cached on disk, beside its file or in the user's cache, until that file

@@ -10,25 +10,13 @@ small blocks and takes loads one by one, which is slower for bands of a few hund
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
-from numba import types
-from numba.core import config
-from numba.extending import intrinsic
 
-from ..machine_code import aligned, compiled
+from ..machine_code import aligned, compiled, inlined
+from ..vectors import BYTES, load, spread, store
 
 PAD, ROWS = 16, 8
 COLUMNS = 16
 """Number of loads that a row of `y [n, COLUMNS]` has room for."""
-
-
-def _vector_bytes() -> int:
-    """Return the size of a vector: of a register with AVX-512, or with AVX2; two registers of smaller processors."""
-    features = config.CPU_FEATURES or binding.get_host_cpu_features().flatten()
-    return 64 if "+avx512f" in features.split(",") else 32
-
-
-VECTOR = _vector_bytes()
 
 
 def storage(unknowns: int, width: int) -> tuple[int, int]:
@@ -42,110 +30,40 @@ def matrix(size: int, stride: int, dtype: Any) -> np.ndarray:
     return aligned(size * (stride + 1) + 2 * PAD, dtype)
 
 
-@intrinsic
-def subtract_products(
-    typing: Any, C: Any, at: Any, step: Any, A: Any, own: Any, turn: Any, B: Any, first: Any, ld: Any, count: Any
-) -> Any:
+@inlined
+def subtract_products(C, at, step, A, own, turn, B, first, ld, count):
     """`C[at + k step + c] -= sum_p A[own + k + p turn] B[first + p ld + c]`: of `ROWS` rows k and a vector of columns c, the sum
-    over `count` rows p. Left to itself numba makes no vectors of it."""
-    signature = types.void(C, types.intp, types.intp, A, types.intp, types.intp, B, *[types.intp] * 3)
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        tile = _Tile(context, builder, signature, args)
-        step, own, turn, ld, count = (args[k] for k in (2, 4, 5, 8, 9))
-        zero, one = (ir.Constant(count.type, value) for value in (0, 1))
-        places = [tile.vector_at(0, args[1], builder.mul(step, tile.number(k))) for k in range(ROWS)]
-        before, totals = builder.block, [tile.load(place) for place in places]
-        loop, after = builder.append_basic_block("sum"), builder.append_basic_block("summed")
-        builder.cbranch(builder.icmp_signed(">", count, zero), loop, after)
-        builder.position_at_end(loop)
-        p, sums = builder.phi(count.type), [builder.phi(tile.vector) for _ in places]
-        behind = tile.load(tile.vector_at(6, args[7], builder.mul(p, ld)))
-        sources = [builder.add(own, tile.number(k)) for k in range(ROWS)]
-        shares = [tile.spread(tile.value_at(3, source, builder.mul(p, turn))) for source in sources]
-        added = [tile.minus_product(total, share, behind) for total, share in zip(sums, shares, strict=True)]
-        following = builder.add(p, one)
-        builder.cbranch(builder.icmp_signed("<", following, count), loop, after)
-        builder.position_at_end(after)
-        for phi, start, value in zip((p, *sums), (zero, *totals), (following, *added), strict=True):
-            phi.add_incoming(start, before)
-            phi.add_incoming(value, loop)
-        results = [builder.phi(tile.vector) for _ in places]
-        for result, start, value in zip(results, totals, added, strict=True):
-            result.add_incoming(start, before)
-            result.add_incoming(value, loop)
-        for place, result in zip(places, results, strict=True):
-            tile.store(result, place)
-        return context.get_dummy_value()
-
-    return signature, codegen
+    over `count` rows p."""
+    C_0, C_1, C_2, C_3 = load(C, at), load(C, at + step), load(C, at + 2 * step), load(C, at + 3 * step)
+    C_4, C_5, C_6, C_7 = load(C, at + 4 * step), load(C, at + 5 * step), load(C, at + 6 * step), load(C, at + 7 * step)
+    for p in range(count):
+        a, b = own + p * turn, load(B, first + p * ld)
+        C_0, C_1, C_2 = C_0 - spread(A, a) * b, C_1 - spread(A, a + 1) * b, C_2 - spread(A, a + 2) * b
+        C_3, C_4, C_5 = C_3 - spread(A, a + 3) * b, C_4 - spread(A, a + 4) * b, C_5 - spread(A, a + 5) * b
+        C_6, C_7 = C_6 - spread(A, a + 6) * b, C_7 - spread(A, a + 7) * b
+    store(C, at, C_0), store(C, at + step, C_1), store(C, at + 2 * step, C_2), store(C, at + 3 * step, C_3)
+    store(C, at + 4 * step, C_4), store(C, at + 5 * step, C_5), store(C, at + 6 * step, C_6), store(C, at + 7 * step, C_7)
 
 
-@intrinsic
-def _eliminate(typing: Any, C: Any, at: Any, step: Any, R: Any, inverse: Any, first: Any) -> Any:
+@inlined
+def _eliminate(C, at, step, R, inverse, first):
     """Of a vector of columns c, the `ROWS` rows `x_k = C[at + k step + c]` become the solution of `R^T y = x`: `y_k = (x_k - sum_j
     R[j ROWS + k] y_j) inverse[first + k]`, j < k."""
-    signature = types.void(C, types.intp, types.intp, R, inverse, types.intp)
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        tile, rows = _Tile(context, builder, signature, args), []
-        for k in range(ROWS):
-            place = tile.vector_at(0, args[1], builder.mul(args[2], tile.number(k)))
-            row = tile.load(place)
-            for j, above in enumerate(rows):
-                row = tile.minus_product(row, tile.spread(tile.value_at(3, tile.number(j * ROWS + k))), above)
-            row = builder.fmul(row, tile.spread(tile.value_at(4, args[5], tile.number(k))))
-            tile.store(row, place)
-            rows.append(row)
-        return context.get_dummy_value()
-
-    return signature, codegen
-
-
-class _Tile:
-    """Vectors of columns in the arrays among the arguments of an intrinsic function."""
-
-    def __init__(self, context: Any, builder: Any, signature: Any, args: Any):
-        self.builder, self.integer, kind = builder, args[1].type, signature.args[0].dtype
-        is_array = [isinstance(each, types.Array) for each in signature.args]
-        arrays = zip(signature.args, args, is_array, strict=True)
-        self.data = [context.make_array(each)(context, builder, value).data if there else None for each, value, there in arrays]
-        self.bytes = kind.bitwidth // 8
-        lanes = VECTOR // self.bytes
-        self.vector = ir.VectorType(context.get_data_type(kind), lanes)
-        self.first_lane = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
-
-    def number(self, value: int) -> Any:
-        return ir.Constant(self.integer, value)
-
-    def _place(self, argument: int, *offsets: Any) -> Any:
-        place = self.data[argument]
-        for offset in offsets:
-            place = self.builder.gep(place, [offset])
-        return place
-
-    def value_at(self, argument: int, *offsets: Any) -> Any:
-        return self.builder.load(self._place(argument, *offsets))
-
-    def vector_at(self, argument: int, *offsets: Any) -> Any:
-        return self.builder.bitcast(self._place(argument, *offsets), self.vector.as_pointer())
-
-    def load(self, place: Any) -> Any:
-        value = self.builder.load(place)
-        value.align = self.bytes
-        return value
-
-    def store(self, value: Any, place: Any) -> None:
-        self.builder.store(value, place).align = self.bytes
-
-    def spread(self, value: Any) -> Any:
-        empty = ir.Constant(self.vector, ir.Undefined)
-        one = self.builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
-        return self.builder.shuffle_vector(one, empty, self.first_lane)
-
-    def minus_product(self, total: Any, a: Any, b: Any) -> Any:
-        product = self.builder.fmul(self.builder.fneg(a), b, flags=("contract",))
-        return self.builder.fadd(product, total, flags=("contract",))
+    y_0 = load(C, at) * spread(inverse, first)
+    y_1 = (load(C, at + step) - spread(R, 1) * y_0) * spread(inverse, first + 1)
+    y_2 = (load(C, at + 2 * step) - spread(R, 2) * y_0 - spread(R, 10) * y_1) * spread(inverse, first + 2)
+    y_3 = load(C, at + 3 * step) - spread(R, 3) * y_0 - spread(R, 11) * y_1 - spread(R, 19) * y_2
+    y_3 = y_3 * spread(inverse, first + 3)
+    y_4 = load(C, at + 4 * step) - spread(R, 4) * y_0 - spread(R, 12) * y_1 - spread(R, 20) * y_2 - spread(R, 28) * y_3
+    y_4 = y_4 * spread(inverse, first + 4)
+    y_5 = load(C, at + 5 * step) - spread(R, 5) * y_0 - spread(R, 13) * y_1 - spread(R, 21) * y_2 - spread(R, 29) * y_3
+    y_5 = (y_5 - spread(R, 37) * y_4) * spread(inverse, first + 5)
+    y_6 = load(C, at + 6 * step) - spread(R, 6) * y_0 - spread(R, 14) * y_1 - spread(R, 22) * y_2 - spread(R, 30) * y_3
+    y_6 = (y_6 - spread(R, 38) * y_4 - spread(R, 46) * y_5) * spread(inverse, first + 6)
+    y_7 = load(C, at + 7 * step) - spread(R, 7) * y_0 - spread(R, 15) * y_1 - spread(R, 23) * y_2 - spread(R, 31) * y_3
+    y_7 = (y_7 - spread(R, 39) * y_4 - spread(R, 47) * y_5 - spread(R, 55) * y_6) * spread(inverse, first + 7)
+    store(C, at, y_0), store(C, at + step, y_1), store(C, at + 2 * step, y_2), store(C, at + 3 * step, y_3)
+    store(C, at + 4 * step, y_4), store(C, at + 5 * step, y_5), store(C, at + 6 * step, y_6), store(C, at + 7 * step, y_7)
 
 
 @compiled
@@ -153,7 +71,7 @@ def factor_rows(U, stride, width, i, inverse, y, count, R):
     """The rows `i` to `i + ROWS` of the matrix in `U` become those of its factor, if all rows before have, and those of the
     first `count` loads `y [n COLUMNS]` the solution of `U^T y = b`; `inverse [n]`: of the factor's diagonal; `R [ROWS ROWS]`: to
     work in. False where a pivot is not positive."""
-    n, lanes = len(inverse), VECTOR // U.itemsize
+    n, lanes = len(inverse), BYTES // U.itemsize
     here, columns, end = PAD + i * stride, i - i % lanes, min(i + ROWS + width, n)
     for c in range(columns, end, lanes):
         p = max(c - width, 0)  # the first row that reaches column c

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....machine_code import aligned, compiled
-from ....mechanics.native_membrane import STENCIL, Surface
+from ....mechanics.native_membrane import CELLS, STENCIL, Surface, places
 from ....solve.band import RIDGES
-from ....solve.native_band import COLUMNS, PAD, ROWS, matrix, storage
+from ....solve.native_band import COLUMNS, PAD, matrix, storage
 from ....solve.native_rows import sum_rows
 from ....solve.stencil_layouts import OFFSETS
+from ....vectors import BYTES, load, store
 from ..robust import geman_mcclure_curvature, geman_mcclure_weight
 from ..traction_loss import LEAST_SCALE, POWER, TINY
 
@@ -90,14 +91,17 @@ class Workspace(NamedTuple):
     """`[m, n, 3]`; as `volume`, the volume's gradient."""
     volume: Any
     A: Any
-    """`[3, 21, m, n]`, the tangent stiffness; weighted: `weighted [3, 21, V]`."""
+    """`[3, 21, P]`, the tangent stiffness, at the `places` of the vertices; as `weighted`."""
+    x: Any
+    """`[3, P]`, and `cells [CELLS, P]`, for `linearise` to work in."""
+    cells: Any
     weighted: Any
     W: Any
-    """`[3, 3, V]`"""
+    """`[3, 3, P]`"""
     of_loads: Any
     """`[3, 2, V]`, forces and the fluid's, weighted."""
     sums: Any
-    """`[90, V]`, blocks of the matrix."""
+    """`[90, P]`, blocks of the matrix."""
     normal: Any
     """`[N, 3]`"""
     fields: Any
@@ -118,6 +122,8 @@ class Workspace(NamedTuple):
     """`[3 N]`, a sum of them."""
     ridges: Any
     """`band.RIDGES`: a loop over an array is compiled once, over a tuple once for each of its numbers."""
+    columns: Any
+    """`[N, 10]`: of a vertex and a block, the block's first column; -1 where there is no such vertex."""
     width: int
     """Diagonals of the matrix above the main one; `stride`: as in `native_band`."""
     stride: int
@@ -126,14 +132,23 @@ class Workspace(NamedTuple):
 def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     """Return the arrays for a grid and a number of markers."""
     m, n = grid
-    N, V, width = (m - 2) * (n - 2), m * n, 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
+    N, V, P = (m - 2) * (n - 2), m * n, places(m, n)
+    width = 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
     size, stride = storage(3 * N, width)
-    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, V), W=(3, 3, V), of_loads=(3, 2, V))
-    shapes |= dict(sums=(90, V), normal=(N, 3), fields=(5, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
+    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, P), x=(3, P), cells=(CELLS, P), W=(3, 3, P))
+    shapes |= dict(weighted=(3, 21, P), of_loads=(3, 2, P))
+    shapes |= dict(sums=(90, P), normal=(N, 3), fields=(5, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
     shapes |= dict(marker_weights=(markers,), inverse=(size,), scale=(size,), solved=(size,), loads=(LOADS, size))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
     arrays |= dict(U=matrix(size, stride, dtype), y=aligned(size * COLUMNS, dtype), ridges=np.array(RIDGES, dtype))
-    return Workspace(width=width, stride=stride, **arrays)
+    return Workspace(columns=_columns(m - 2, n - 2), width=width, stride=stride, **arrays)
+
+
+def _columns(lines: int, across: int) -> np.ndarray:
+    """Return the first columns of the blocks, `[N, 10]`."""
+    (i, j), (further, beside) = np.indices((lines, across)).reshape(2, -1, 1), np.array(OFFSETS).T
+    there = (i + further < lines) & (j + beside >= 0) & (j + beside < across)
+    return np.where(there, 3 * ((i + further) * across + j + beside), -1)
 
 
 @compiled
@@ -200,7 +215,7 @@ def weight_of_shear(k, push2):
 def load_forces(c, work):
     """Add the forces to the loads as `BalanceEquations.loads` does; return `f W v` and `v W v`."""
     m, n = c.surface.free.shape
-    V, loads, of_loads, fWv, vWv = m * n, work.loads, work.of_loads, 0.0, 0.0
+    loads, of_loads, fWv, vWv = work.loads, work.of_loads, 0.0, 0.0
     loads[:], of_loads[:] = 0, 0
     for i in range(1, m - 1):
         for j in range(1, n - 1):
@@ -213,47 +228,55 @@ def load_forces(c, work):
                     fWv += of_loads[a, 0, at] * work.volume[i, j, a]
                     vWv -= of_loads[a, 1, at] * work.volume[i, j, a]
                     loads[VOLUME, 3 * k + a] = work.volume[i, j, a]
-    A, first, count, sums = work.A.reshape((3, 21, V)), n + 1, V - 2 * n - 2, work.sums
-    for load in range(2):
+    A, sums, P = work.A, work.sums, work.A.shape[2]
+    for k in range(n + 1, m * n - n - 1, BYTES // A.itemsize):
         for d in range(3):
-            sums[d] = 0
+            of_forces = of_fluid = load(A, k) * 0.0
             for s in range(7):
-                at = first - STENCIL[s][0] * n - STENCIL[s][1]
-                _add_products(sums[d], first, count, A, 3 * s + d, of_loads, load, at)
-        for k in range((m - 2) * (n - 2)):
-            at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
-            for d in range(3):
-                loads[FORCES + load, 3 * k + d] = sums[d, at]
+                at = k - STENCIL[s][0] * n - STENCIL[s][1]
+                a0, a1, a2 = _three(A, (3 * s + d) * P + at, 21 * P)
+                b0, b1, b2 = _three(of_loads, at, 2 * P)
+                c0, c1, c2 = _three(of_loads, P + at, 2 * P)
+                of_forces = of_forces + (a0 * b0 + a1 * b1 + a2 * b2)
+                of_fluid = of_fluid + (a0 * c0 + a1 * c1 + a2 * c2)
+            store(sums, d * P + k, of_forces)
+            store(sums, (3 + d) * P + k, of_fluid)
+    for k in range((m - 2) * (n - 2)):
+        at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
+        for d in range(3):
+            loads[FORCES, 3 * k + d], loads[FLUID, 3 * k + d] = sums[d, at], sums[3 + d, at]
     return fWv, vWv
 
 
 @compiled
-def _add_products(total, first, count, a, of_a, b, of_b, at):
-    """Add `sum_c a[c, of_a, at + k] b[c, of_b, at + k]` to `total[first + k]` for `count` vertices."""
-    out = total[first : first + count]
-    a0, a1, a2 = a[0, of_a, at : at + count], a[1, of_a, at : at + count], a[2, of_a, at : at + count]
-    b0, b1, b2 = b[0, of_b, at : at + count], b[1, of_b, at : at + count], b[2, of_b, at : at + count]
-    for k in range(count):
-        out[k] += a0[k] * b0[k] + a1[k] * b1[k] + a2[k] * b2[k]
+def _three(array, at, stride):
+    """Return three vectors of an array."""
+    return load(array, at), load(array, at + stride), load(array, at + 2 * stride)
 
 
 @compiled
 def sum_blocks(c, work):
     """Sum `A^T W A` and the markers' blocks in `sums [10 3 3, V]`: the blocks between the vertices and those at `OFFSETS`."""
     (m, n), (corners, pulls) = c.surface.free.shape, c.corners
-    V, sums, WA = m * n, work.sums, work.weighted
-    A, W, first, count = work.A.reshape((3, 21, V)), work.W, n + 1, V - 2 * n - 2
-    WA[:], sums[:] = 0, 0
-    for a in range(3):
+    V, P, sums, A, WA, W = m * n, work.A.shape[2], work.sums, work.A, work.weighted, work.W
+    sums[:] = 0
+    for k in range(0, V, BYTES // A.itemsize):
         for t in range(21):
-            _add_products(WA[a, t], 0, V, W, a, A, t, 0)
-    for s in range(7):
-        at = first - STENCIL[s][0] * n - STENCIL[s][1]
-        for other in range(s, 7):
-            block = 9 * BETWEEN[s][other]
+            a0, a1, a2 = _three(A, t * P + k, 21 * P)
             for a in range(3):
+                w0, w1, w2 = _three(W, 3 * a * P + k, P)
+                store(WA, (21 * a + t) * P + k, w0 * a0 + w1 * a1 + w2 * a2)
+    for k in range(n + 1, V - n - 1, BYTES // A.itemsize):
+        for s in range(7):
+            at = k - STENCIL[s][0] * n - STENCIL[s][1]
+            of_s = _three(A, 3 * s * P + at, 21 * P), _three(A, (3 * s + 1) * P + at, 21 * P), _three(A, (3 * s + 2) * P + at, 21 * P)
+            for other in range(s, 7):
                 for b in range(3):
-                    _add_products(sums[block + 3 * a + b], first, count, A, 3 * s + a, WA, 3 * other + b, at)
+                    b0, b1, b2 = _three(WA, (3 * other + b) * P + at, 21 * P)
+                    block = (9 * BETWEEN[s][other] + b) * P + k
+                    for a in range(3):
+                        a0, a1, a2 = of_s[a]
+                        store(sums, block + 3 * a * P, load(sums, block + 3 * a * P) + a0 * b0 + a1 * b1 + a2 * b2)
     for d in range(len(work.blocks)):
         for s in range(3):
             for other in range(3):
@@ -279,23 +302,22 @@ def scale_rows(c, work, damping):
 
 
 @compiled
-def write_rows(c, work, first, ridge, used):
-    """Write `ROWS` rows of the matrix of the blocks to `U`, and of the first `used` loads to `y`, scaled by `scale`, with the
-    ridge added."""
-    (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
-    stride, inner = work.stride, n - 2
-    U[first * (stride + 1) + 1 : (first + ROWS) * (stride + 1) + 1] = 0
-    for r in range(first, first + ROWS):
-        start, k, a = PAD + r * stride, r // 3, r % 3
-        i, j = k // inner, k % inner
-        if i < m - 2:
-            at = (i + 1) * n + j + 1
-            for block in range(10):
-                p, q = i + OFFSETS[block][0], j + OFFSETS[block][1]
-                if p < m - 2 and 0 <= q < inner:
-                    column = 3 * (p * inner + q)
-                    for b in range(3):
-                        U[start + column + b] = sums[9 * block + 3 * a + b, at] * scale[r] * scale[column + b]
-        U[start + r] = 1 + ridge
-        for load in range(used):
-            work.y[r * COLUMNS + load] = work.loads[load, r] * scale[r]
+def write_vertices(c, work, first, end, ridge, used):
+    """Write the rows of some vertices, from `first` up to `end`, of the matrix of the blocks to `U`, and of the first `used`
+    loads to `y`, scaled by `scale`, with the ridge added. Vertices after the last one have rows of zeros but on the diagonal."""
+    n, U, sums, scale, stride = c.surface.free.shape[1], work.U, work.sums, work.scale, work.stride
+    for k in range(first, end):
+        row, at = 3 * k, (k // (n - 2) + 1) * n + k % (n - 2) + 1
+        U[row * (stride + 1) + 1 : (row + 3) * (stride + 1) + 1] = 0
+        for block in range(10 if k < len(work.columns) else 0):
+            column = work.columns[k, block]
+            for a in range(3 if column >= 0 else 0):
+                start = PAD + (row + a) * stride + column
+                for b in range(3):
+                    U[start + b] = sums[9 * block + 3 * a + b, at] * scale[row + a] * scale[column + b]
+        for r in range(row, min(row + 3, len(scale))):
+            U[PAD + r * (stride + 1)] = 1 + ridge
+            of_row = work.y[r * COLUMNS : (r + 1) * COLUMNS]
+            of_row[used:] = 0
+            for of_load in range(used):
+                of_row[of_load] = work.loads[of_load, r] * scale[r]

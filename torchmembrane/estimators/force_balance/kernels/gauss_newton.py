@@ -9,11 +9,12 @@ import numpy as np
 from ....machine_code import compiled
 from ....mechanics.cavity import gas_law_step
 from ....mechanics.native_membrane import linearise
-from ....solve.native_band import COLUMNS, ROWS, VECTOR, backward, factor_rows, subtract_products
+from ....solve.native_band import COLUMNS, ROWS, backward, factor_rows, subtract_products
 from ....solve.symmetric_2x2 import symmetric_solution
+from ....vectors import BYTES
 from ..camera_motion import camera_stiffness
 from ..schedule import LEAST_MOVE, SETTLING_DAMPING, falling, outlier_scale, scaled_step
-from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, load_forces, scale_rows, sum_blocks, weigh, write_rows
+from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, load_forces, scale_rows, sum_blocks, weigh, write_vertices
 from .markers import load_markers
 from .solution import OBJECTIVE, TOLD, solution_of
 
@@ -71,7 +72,7 @@ def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, damping):
     """Take one step in place: `u [m, n, 3]`, `pressure [1]` and `moved [4]` are overwritten."""
     (m, n), k = c.surface.free.shape, c.numbers
     outlier = scale_of_outliers(k.outlier, tau / k.last_tau)
-    rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
+    rise = linearise(c.surface, u, pressure, work.x, work.cells, work.force, work.A, work.volume) - c.numbers.rest_volume
     own, slope = np.zeros((4, 4)), np.zeros(4)
     weigh(c, work, noise_level, tau, np.bool_(False))
     fWv, vWv = load_forces(c, work)
@@ -106,7 +107,7 @@ def factored(c, work, damping, used):
     while not found and tried < len(work.ridges):
         first, found = 0, True
         while found and first < len(work.scale):
-            write_rows(c, work, first, work.ridges[tried], used)
+            write_vertices(c, work, -(-first // 3), -(-(first + ROWS) // 3), work.ridges[tried], used)
             found = factor_rows(work.U, work.stride, work.width, first, work.inverse, work.y, used, R)
             first += ROWS
         tried += 1
@@ -119,7 +120,7 @@ def factored(c, work, damping, used):
 def _products(y, used):
     """Return the products of the first `used` columns of `y [3 N, COLUMNS]`, `[COLUMNS, COLUMNS]`. Those of `PART` rows are
     summed at a time."""
-    products, lanes = np.zeros((COLUMNS, COLUMNS)), VECTOR // y.itemsize
+    products, lanes = np.zeros((COLUMNS, COLUMNS)), BYTES // y.itemsize
     part, rows = np.empty(COLUMNS * COLUMNS, y.dtype), len(y) // COLUMNS
     for first in range(0, rows, PART):
         part[:] = 0

@@ -19,7 +19,7 @@ loss_of_push = compiled(geman_mcclure_loss)
 def solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, far, told, traction, reference):
     """Compute `told [6]`, `traction [m, n, 3]` and `reference [m, n]` of a state; `far` is the limit of a marker's angle."""
     (m, n), k, step2 = c.surface.free.shape, c.numbers, 0.0
-    told[VOLUME] = linearise(c.surface, u, pressure, work.force, work.A, work.volume)
+    told[VOLUME] = linearise(c.surface, u, pressure, work.x, work.cells, work.force, work.A, work.volume)
     scaled(c, work, noise_level, k.last_tau)
     for i in range(m):
         for j in range(n):

@@ -17,7 +17,7 @@ from .markers import load_markers
 def spread_of(c, work, u, pressure, moved, seen, noise_level, gauge, outlier, damping, found):
     """Return the standard deviations `[4]` at the state of a frame, with the scale `outlier` of the markers' loss."""
     own, slope, shares = np.zeros((4, 4)), np.zeros(4), np.zeros(LOADS, u.dtype)
-    rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
+    rise = linearise(c.surface, u, pressure, work.x, work.cells, work.force, work.A, work.volume) - c.numbers.rest_volume
     weigh(c, work, noise_level, c.numbers.last_tau, np.bool_(True))
     vWv = load_forces(c, work)[1] + gauge[1]
     load_markers(c, work, u, moved, seen, outlier, own, slope)
@@ -58,7 +58,7 @@ def _load_wanted(c, work, u):
                 by_pressure[a] -= work.volume[i, j, a]
             for b in range(3):
                 for s in range(7):
-                    loads[WANTED + b, 3 * k + a] += work.A[a, 3 * s + b, i, j]
+                    loads[WANTED + b, 3 * k + a] += work.A[a, 3 * s + b, i * n + j]
     for k in range(N):
         for a in range(3):
             loads[WANTED + 3, 3 * k + a] = c.inwards[k, a] / count if depth[k] == deepest else 0.0

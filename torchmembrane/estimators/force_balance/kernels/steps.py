@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .... import vectors
 from ....machine_code import Kept, fingerprint, kept
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
@@ -195,11 +196,10 @@ def _nothing(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _volume(surface: Surface) -> float:
-    """Return the volume at rest (eq. 19), summed over triangles in the same order as in the steps."""
-    edges = surface.edges.astype(float)
-    spins = np.cross(edges[:, 0], edges[:, 1], axis=0).sum(1)
-    inner: np.ndarray = surface.rest[:-1, :-1].astype(float)
-    return float(surface.law[4] * (inner * np.moveaxis(spins, 0, -1)).sum())
+    """Return the volume at rest (eq. 19), summed over the cells as in the steps."""
+    edges, rest = surface.edges.astype(float), surface.rest.reshape(-1, 3).T.astype(float)
+    spins = np.cross(edges[:, 0], edges[:, 1], axis=0).sum(1)[:, : rest.shape[1]]
+    return float((surface.sixth[: rest.shape[1]] * rest * spins).sum())
 
 
 def _sparse(rows: np.ndarray, count: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -258,7 +258,7 @@ def _entry(sources: str) -> Any:
 SOURCES = fingerprint(
     __file__,
     *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, markers, native_band, native_membrane)),
-    *(each.__file__ for each in (native_rows, robust, schedule, solution, spread, symmetric_2x2)),
+    *(each.__file__ for each in (native_rows, robust, schedule, solution, spread, symmetric_2x2, vectors)),
 )
 frames = _entry(SOURCES)
 compiled = Kept(frames, SOURCES)

@@ -1,0 +1,121 @@
+"""Vectors of consecutive numbers in machine code: as many as a register of the processor holds are computed at once.
+
+`load` reads a vector from an array, `spread` makes one of a single number, and `store` writes it; between them `+`, `-`, `*` and `/` compute with vectors, and with
+numbers, which stand for vectors of equal ones. numba makes vectors of simple loops only by itself.
+"""
+
+import operator
+from typing import Any
+
+from llvmlite import binding, ir
+from numba import types
+from numba.core import config
+from numba.core.datamodel import models
+from numba.extending import intrinsic, overload, register_model
+
+
+def _bytes() -> int:
+    """Return the size of a vector: of a register with AVX-512, or with AVX2; of two registers of smaller processors."""
+    features = config.CPU_FEATURES or binding.get_host_cpu_features().flatten()
+    return 64 if "+avx512f" in features.split(",") else 32
+
+
+BYTES = _bytes()
+
+
+class Vector(types.Type):
+    """The type of vectors of numbers of a type."""
+
+    def __init__(self, dtype: Any):
+        self.dtype = dtype
+        super().__init__(name=f"Vector({dtype})")
+
+    @property
+    def lanes(self) -> int:
+        """Return how many numbers a vector holds."""
+        return BYTES * 8 // int(self.dtype.bitwidth)
+
+
+@register_model(Vector)
+class VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    """A vector in machine code."""
+
+    def __init__(self, manager: Any, kind: Any):
+        number = manager.lookup(kind.dtype).get_value_type()
+        super().__init__(manager, kind, ir.VectorType(number, kind.lanes))
+
+
+def _place(context: Any, builder: Any, kind: Any, array: Any, at: Any, vector: Any) -> Any:
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [at]), vector.as_pointer())
+
+
+@intrinsic
+def load(typing: Any, array: Any, at: Any) -> Any:
+    """Return the vector of the numbers from place `at` on of a contiguous array, counted over all its dimensions."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        vector = context.get_value_type(signature.return_type)
+        value = builder.load(_place(context, builder, signature.args[0], *args, vector))
+        value.align = array.dtype.bitwidth // 8
+        return value
+
+    return Vector(array.dtype)(array, types.intp), codegen
+
+
+@intrinsic
+def spread(typing: Any, array: Any, at: Any) -> Any:
+    """Return a vector of equal numbers, that at place `at` of a contiguous array."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(array)(context, builder, args[0]).data
+        return _spread(context, builder, signature.return_type, array.dtype, builder.load(builder.gep(data, [args[1]])))
+
+    return Vector(array.dtype)(array, types.intp), codegen
+
+
+@intrinsic
+def store(typing: Any, array: Any, at: Any, value: Any) -> Any:
+    """Write a vector to the places from `at` on of a contiguous array."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = _place(context, builder, signature.args[0], *args[:2], args[2].type)
+        builder.store(args[2], place).align = array.dtype.bitwidth // 8
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), codegen
+
+
+def _define(operation: Any, instruction: str) -> None:
+    """Define an operation for two vectors, and for a vector and a number."""
+
+    @intrinsic
+    def compute(typing: Any, a: Any, b: Any) -> Any:
+        vector = a if isinstance(a, Vector) else b
+
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            both = [_spread(context, builder, vector, *each) for each in zip(signature.args, args, strict=True)]
+            flags = () if instruction == "fdiv" else ("contract",)
+            return getattr(builder, instruction)(*both, flags=flags)
+
+        return vector(a, b), codegen
+
+    @overload(operation, strict=False)
+    def of_vectors(a: Any, b: Any) -> Any:
+        if isinstance(a, Vector) or isinstance(b, Vector):
+            return lambda a, b: compute(a, b)
+        return None
+
+
+def _spread(context: Any, builder: Any, vector: Vector, kind: Any, value: Any) -> Any:
+    """Return a vector, or one of equal numbers."""
+    if isinstance(kind, Vector):
+        return value
+    number, whole = context.cast(builder, value, kind, vector.dtype), context.get_value_type(vector)
+    index, empty = ir.IntType(32), ir.Constant(whole, ir.Undefined)
+    one = builder.insert_element(empty, number, ir.Constant(index, 0))
+    return builder.shuffle_vector(one, empty, ir.Constant(ir.VectorType(index, vector.lanes), [0] * vector.lanes))
+
+
+for _operation, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
+    _define(_operation, _instruction)
