@@ -159,16 +159,15 @@ def scaled(c, work, noise_level, tau):
     q_n, shear2, push2, around, shares = work.fields
     for i in range(N):
         p, q = i // (n - 2) + 1, i % (n - 2) + 1
-        square, along, across2 = 0.0, 0.0, 0.0
+        square, along, across2 = work.volume[p, q, 0] ** 2 + work.volume[p, q, 1] ** 2 + work.volume[p, q, 2] ** 2, 0.0, 0.0
+        inverse = 1 / np.sqrt(square)
         for a in range(3):
-            square += work.volume[p, q, a] ** 2
-        for a in range(3):
-            work.normal[i, a] = work.volume[p, q, a] / np.sqrt(square)
+            work.normal[i, a] = work.volume[p, q, a] * inverse
             along += work.force[p, q, a] * work.normal[i, a]
         for a in range(3):
             across2 += (work.force[p, q, a] - along * work.normal[i, a]) ** 2
-        unit = c.area[i] * k.reference
-        q_n[i], shear2[i] = along / unit, across2 / unit**2
+        unit = 1 / (c.area[i] * k.reference)
+        q_n[i], shear2[i] = along * unit, across2 * unit**2
         shares[i] = 0.0 if q_n[i] >= 0 else q_n[i] ** 2
     sum_rows(push2, c.surroundings, c.surroundings_within, shares)
     top = TINY
@@ -180,7 +179,7 @@ def scaled(c, work, noise_level, tau):
     sum_rows(around, c.wider, c.wider_within, shares)
     least = min(max(tau / k.last_tau - 1, LEAST_SCALE), 1.0) ** 2
     for i in range(N):
-        expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
+        expected = top * np.sqrt(np.sqrt(max(around[i], TINY))) * k.scale_share**2  # the root of POWER 4
         expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
         around[i] = min(max(expected / k.last_tau**2, least), 1.0)
 
