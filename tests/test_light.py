@@ -121,7 +121,7 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     measured = bearings.measured(seen(torch.zeros_like(rays), rays))
     state = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
     quadratic = torch.full_like(state.pressure, torch.inf)
-    u, pressure, moved = estimator.gauss_newton.step(state, measured, quadratic, torch.zeros_like(quadratic))
+    u, pressure, moved = estimator.gauss_newton.step(state, measured, quadratic, torch.ones_like(quadratic))
     traction = estimator.equilibrium(u, pressure, moved, u, measured).traction
     _, normal = at_rest(estimator)
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small

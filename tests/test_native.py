@@ -81,7 +81,7 @@ def expected(balance, state, measured, tau=0.4):
     """After one step by tensor operations."""
     tau = torch.full_like(state.pressure, tau)
     with torch.no_grad():
-        return *balance.gauss_newton.step(state, measured, tau, 0 * tau), state.u
+        return *balance.gauss_newton.step(state, measured, tau, torch.ones_like(tau)), state.u
 
 
 def assert_same(found, wanted, rtol=1e-9):
@@ -149,7 +149,7 @@ def test_what_a_state_amounts_to_is_that_of_tensor_operations(filling, hole, gri
 
 @pytest.mark.parametrize("steps, tol, settle", [(2, 3e-5, 0), (9, 3e-5, 0), (20, 3e-5, 1), (60, 3e-5, 1), (60, 1e-2, 1)])
 def test_a_schedule_is_that_of_tensor_operations(steps, tol, settle):
-    """Until every frame has settled, of which some do early; and where damped steps keep the likeliest of their states."""
+    """Until every frame has settled, of which some do early; and where the last steps are relaxed."""
     balance = estimator()
     set_settings(balance, settled_step_tol=tol)
     state, measured = problem(balance)
@@ -160,20 +160,6 @@ def test_a_schedule_is_that_of_tensor_operations(steps, tol, settle):
     assert_same(found, [*after, before], rtol=1e-6)
     moved = (after.u - before).square().sum(-1).mean(-1).sqrt() / balance.size
     assert (moved <= tol).tolist() == 3 * [bool(settle)]
-
-
-def test_the_likeliest_of_the_last_states_is_that_of_tensor_operations():
-    """Of steps that never settle: the lowest objective is that of the last one in the first frame alone."""
-    balance, last = estimator(prestretch=1.1), []
-    set_settings(balance, settled_step_tol=0.0)
-    state, measured = problem(balance)
-    state = State(0.1 * state.u, *state[1:])
-    step = balance.gauss_newton.step
-    with torch.no_grad(), using(False), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(balance.gauss_newton, "_compiled_step", lambda *given: last.append(step(*given)) or last[-1])
-        after, before = balance.gauss_newton(state, measured, 4.0, 20)
-    assert [torch.equal(after.u[k], last[-1].u[k]) for k in range(3)] == [True, False, False]
-    assert_same(taken(balance, state, measured, 4.0, 20), [*after, before], rtol=1e-6)
 
 
 def test_every_setting_is_heard_of():

@@ -1,7 +1,8 @@
-"""Vectors of consecutive numbers in machine code: as many as a register of the processor holds are computed at once.
+"""Vectors of consecutive numbers in machine code: an operation computes as many numbers as a register of the processor holds.
 
-`load` reads a vector from an array, `spread` makes one of a single number, and `store` writes it; between them `+`, `-`, `*` and `/` compute with vectors, and with
-numbers, which stand for vectors of equal ones. numba makes vectors of simple loops only by itself.
+`load` reads a vector from an array, `spread` fills one with a single number, and `store` writes it. Between these, `+`, `-`,
+`*` and `/` compute with vectors, and with numbers, which stand for vectors of equal numbers. Without this, numba uses the
+processor's vectors only for simple loops.
 """
 
 import operator
@@ -15,12 +16,13 @@ from numba.extending import intrinsic, overload, register_model
 
 
 def _bytes() -> int:
-    """Return the size of a vector: of a register with AVX-512, or with AVX2; of two registers of smaller processors."""
+    """Return the size of a vector: that of a register with AVX-512, else that of one with AVX2; other processors use two."""
     features = config.CPU_FEATURES or binding.get_host_cpu_features().flatten()
     return 64 if "+avx512f" in features.split(",") else 32
 
 
 BYTES = _bytes()
+"""Size of a vector in bytes."""
 
 
 class Vector(types.Type):
@@ -37,7 +39,7 @@ class Vector(types.Type):
 
 
 @register_model(Vector)
-class VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+class VectorModel(models.PrimitiveModel):
     """A vector in machine code."""
 
     def __init__(self, manager: Any, kind: Any):
@@ -45,18 +47,18 @@ class VectorModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, kind, ir.VectorType(number, kind.lanes))
 
 
-def _place(context: Any, builder: Any, kind: Any, array: Any, at: Any, vector: Any) -> Any:
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [at]), vector.as_pointer())
+def _place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
+    """Return a pointer to a number of an array."""
+    return builder.gep(context.make_array(kind)(context, builder, array).data, [at])
 
 
 @intrinsic
 def load(typing: Any, array: Any, at: Any) -> Any:
-    """Return the vector of the numbers from place `at` on of a contiguous array, counted over all its dimensions."""
+    """Return the vector of the numbers from place `at` on of a contiguous array; places count through all its dimensions."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vector = context.get_value_type(signature.return_type)
-        value = builder.load(_place(context, builder, signature.args[0], *args, vector))
+        place, vector = _place(context, builder, array, *args), context.get_value_type(signature.return_type)
+        value = builder.load(builder.bitcast(place, vector.as_pointer()))
         value.align = array.dtype.bitwidth // 8
         return value
 
@@ -65,11 +67,11 @@ def load(typing: Any, array: Any, at: Any) -> Any:
 
 @intrinsic
 def spread(typing: Any, array: Any, at: Any) -> Any:
-    """Return a vector of equal numbers, that at place `at` of a contiguous array."""
+    """Return a vector that is filled with the number at place `at` of a contiguous array."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(array)(context, builder, args[0]).data
-        return _spread(context, builder, signature.return_type, array.dtype, builder.load(builder.gep(data, [args[1]])))
+        number = builder.load(_place(context, builder, array, *args))
+        return _spread(context, builder, signature.return_type, array.dtype, number)
 
     return Vector(array.dtype)(array, types.intp), codegen
 
@@ -79,7 +81,7 @@ def store(typing: Any, array: Any, at: Any, value: Any) -> Any:
     """Write a vector to the places from `at` on of a contiguous array."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = _place(context, builder, signature.args[0], *args[:2], args[2].type)
+        place = builder.bitcast(_place(context, builder, array, *args[:2]), args[2].type.as_pointer())
         builder.store(args[2], place).align = array.dtype.bitwidth // 8
         return context.get_dummy_value()
 
@@ -108,7 +110,7 @@ def _define(operation: Any, instruction: str) -> None:
 
 
 def _spread(context: Any, builder: Any, vector: Vector, kind: Any, value: Any) -> Any:
-    """Return a vector, or one of equal numbers."""
+    """Return a value if it is a vector, else a vector of this number."""
     if isinstance(kind, Vector):
         return value
     number, whole = context.cast(builder, value, kind, vector.dtype), context.get_value_type(vector)
@@ -117,5 +119,5 @@ def _spread(context: Any, builder: Any, vector: Vector, kind: Any, value: Any) -
     return builder.shuffle_vector(one, empty, ir.Constant(ir.VectorType(index, vector.lanes), [0] * vector.lanes))
 
 
-for _operation, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
-    _define(_operation, _instruction)
+for _operation, _instruction in {"add": "fadd", "sub": "fsub", "mul": "fmul", "truediv": "fdiv"}.items():
+    _define(getattr(operator, _operation), _instruction)

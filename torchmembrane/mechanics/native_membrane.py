@@ -92,7 +92,8 @@ def linearise(surface, u, pressure, x, cells, force, A, volume):
     """The contact force, its tangent stiffness and the gradient of the volume, at the inner vertices; the volume.
 
     `u [m, n, 3]` the displacement, `pressure [1]`; `force [m, n, 3]`, `A [3, 21, P]` (of a component, in the components of the
-    stencil's vertices) and `volume [m, n, 3]` are filled at inner vertices; `x [3, P]` and `cells [CELLS, P]` are to work in. At vertices that are not free the force is zero, as are all entries of `A` in their rows and columns.
+    stencil's vertices) and `volume [m, n, 3]` are filled at inner vertices; `x [3, P]` and `cells [CELLS, P]` are
+    working memory. At vertices that are not free the force is zero, as are all entries of `A` in their rows and columns.
     """
     (m, n), enclosed = surface.free.shape, 0.0
     for i in range(m):

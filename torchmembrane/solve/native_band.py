@@ -1,10 +1,11 @@
-"""Symmetric positive definite band matrices by machine code: factor `M = U^T U` row by row, and solve in halves.
+"""Symmetric positive definite band matrices by machine code: factor `M = U^T U`, and solve with each half.
 
-The upper half of a matrix is stored in rows: row `r`, column `c` at `PAD + r stride + c`. `stride` is a multiple of `PAD`, so that
-columns of all rows are aligned alike, and leaves room for vectors that begin before the diagonal or end behind the last one.
-`ROWS` rows of `U` are found at a time from all rows before them (a left-looking factorisation): a tile of `ROWS` rows and as many
-columns as a vector register holds stays in registers while the products of the earlier rows are subtracted. LAPACK works on
-small blocks and takes loads one by one, which is slower for bands of a few hundred.
+The upper half of a matrix is stored in rows: row `r`, column `c` at `PAD + r stride + c`. `stride` is a multiple of `PAD`, so
+that the columns of all rows are aligned alike, and it leaves room for vectors that begin before the diagonal or end behind the
+last diagonal. The factorisation is left-looking: `ROWS` rows of `U` at a time are computed from all rows before them. A tile of
+`ROWS` rows, with as many columns as a vector register holds, stays in registers while the products of the earlier rows are
+subtracted. LAPACK works on smaller blocks and solves for one right-hand side at a time, which is slower for bands of a few
+hundred diagonals.
 """
 
 from typing import Any
@@ -20,20 +21,20 @@ COLUMNS = 16
 
 
 def storage(unknowns: int, width: int) -> tuple[int, int]:
-    """Of a matrix with so many unknowns and `width` diagonals above the main one: how many unknowns to solve for, the last of
-    them with a 1 on the diagonal, and `stride`."""
+    """Return, for a matrix with so many unknowns and `width` diagonals above the main one, the number of rows, a multiple of
+    `PAD`, and `stride`. The rows behind the last unknown have a 1 on the diagonal."""
     return -(-unknowns // PAD) * PAD, -(-(width + 2 * PAD + ROWS) // PAD) * PAD
 
 
 def matrix(size: int, stride: int, dtype: Any) -> np.ndarray:
-    """Return zeros in which a matrix with `size` rows is stored."""
+    """Return the memory for a matrix with `size` rows, filled with zeros."""
     return aligned(size * (stride + 1) + 2 * PAD, dtype)
 
 
 @inlined
 def subtract_products(C, at, step, A, own, turn, B, first, ld, count):
-    """`C[at + k step + c] -= sum_p A[own + k + p turn] B[first + p ld + c]`: of `ROWS` rows k and a vector of columns c, the sum
-    over `count` rows p."""
+    """Compute `C[at + k step + c] -= sum_p A[own + k + p turn] B[first + p ld + c]` for `ROWS` rows k and a vector of columns
+    c; the sum is over `count` rows p."""
     C_0, C_1, C_2, C_3 = load(C, at), load(C, at + step), load(C, at + 2 * step), load(C, at + 3 * step)
     C_4, C_5, C_6, C_7 = load(C, at + 4 * step), load(C, at + 5 * step), load(C, at + 6 * step), load(C, at + 7 * step)
     for p in range(count):
@@ -47,8 +48,8 @@ def subtract_products(C, at, step, A, own, turn, B, first, ld, count):
 
 @inlined
 def _eliminate(C, at, step, R, inverse, first):
-    """Of a vector of columns c, the `ROWS` rows `x_k = C[at + k step + c]` become the solution of `R^T y = x`: `y_k = (x_k - sum_j
-    R[j ROWS + k] y_j) inverse[first + k]`, j < k."""
+    """Replace `ROWS` rows `x_k = C[at + k step + c]` of a vector of columns c by the solution of `R^T y = x`, which is
+    `y_k = (x_k - sum_j R[j ROWS + k] y_j) inverse[first + k]`, summed over j < k."""
     y_0 = load(C, at) * spread(inverse, first)
     y_1 = (load(C, at + step) - spread(R, 1) * y_0) * spread(inverse, first + 1)
     y_2 = (load(C, at + 2 * step) - spread(R, 2) * y_0 - spread(R, 10) * y_1) * spread(inverse, first + 2)
@@ -68,9 +69,9 @@ def _eliminate(C, at, step, R, inverse, first):
 
 @compiled
 def factor_rows(U, stride, width, i, inverse, y, count, R):
-    """The rows `i` to `i + ROWS` of the matrix in `U` become those of its factor, if all rows before have, and those of the
-    first `count` loads `y [n COLUMNS]` the solution of `U^T y = b`; `inverse [n]`: of the factor's diagonal; `R [ROWS ROWS]`: to
-    work in. False where a pivot is not positive."""
+    """Replace the rows `i` to `i + ROWS` of the matrix in `U` by those of its factor, after all rows before them, and the same
+    rows of the first `count` loads `y [n COLUMNS]` by the solution of `U^T y = b`. `inverse [n]`: one over the factor's
+    diagonal; `R [ROWS ROWS]`: working memory. Return whether all pivots are positive."""
     n, lanes = len(inverse), BYTES // U.itemsize
     here, columns, end = PAD + i * stride, i - i % lanes, min(i + ROWS + width, n)
     for c in range(columns, end, lanes):
@@ -101,7 +102,7 @@ def factor_rows(U, stride, width, i, inverse, y, count, R):
 
 @compiled
 def backward(U, stride, width, inverse, y):
-    """`y [n]` becomes `x` with `U x = y`."""
+    """Replace `y [n]` by the solution `x` of `U x = y`."""
     n = len(inverse)
     for k in range(n - 1, -1, -1):
         reach = min(width, n - 1 - k)

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...control_flow import chunked, repeat_rows, traced, where_rows
+from ...control_flow import chunked, repeat_rows, traced
 from ...machine_code import takes
 from ...mechanics.cavity import CavityLaw
 from ...solve.implicit import differentiable, differentiable_fixed_point
@@ -18,9 +18,8 @@ from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
-from .schedule import LEAST_MOVE, SETTLING_DAMPING, falling, outlier_scale, scaled_step, settling_of
+from .schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step, settling_of
 from .settings import ForceBalanceSettings
-from .traction_loss import LossTerms
 
 VERTICES = 9000
 """Number of vertices of a batch that are processed at a time, so that the data of a step stay in the processor's cache; machine
@@ -61,7 +60,7 @@ class GaussNewton(nn.Module):
         """Return the state in which each frame has settled, and the displacement before the last step.
 
         A frame has settled when the `scaled_step` at the last `tau` is at most `settled_step_tol`. Frames that have not settled
-        when `SETTLING_STEPS` steps are left take these with more damping, and the state with the lowest objective is kept.
+        when `SETTLING_STEPS` steps are left take a part of each of these, `RELAXATION`.
 
         Args:
             state: initial state.
@@ -79,26 +78,24 @@ class GaussNewton(nn.Module):
         """Return the state after the steps, and the displacement before the last; `given` are the rays, the first `tau` and the
         number of steps."""
         *of_markers, tau, steps = given
-        state, settling = State(u, pressure, moved), settling_of(steps)
+        state = State(u, pressure, moved)
         if self.is_native(*state, *of_markers):
             return tuple(self.native.take(*self._given, state, MeasuredRays(*of_markers), tau, steps))
-        found = repeat_rows(self._next, steps - settling, self._begun(*state, tau), of_markers)[:5]
-        if settling:
-            found = repeat_rows(self._next_keeping_best, settling, (*found, *self._none_better(*found[1:])), of_markers)[5:]
-        return tuple(found[1:])
+        begun = self._begun(*state, tau, float(steps - settling_of(steps)))
+        return tuple(repeat_rows(self._next, steps, begun, of_markers)[1:5])
 
     def with_gradients(self, state: State, measured: MeasuredRays) -> State:
         """Return a state in which all frames have settled, with the gradients of the fixed point of the steps."""
         if not torch.is_grad_enabled() or self.is_native(*state, *measured):
             return state
         sizes = [state.u[0].numel(), 1, state.moved.shape[1]]
-        tau, undamped = (torch.full_like(state.pressure, value) for value in (self.settings.tau[1], 0.0))
+        tau, whole = (torch.full_like(state.pressure, value) for value in (self.settings.tau[1], 1.0))
 
         def stepped(unknowns: Tensor) -> Tensor:
             u, pressure, moved = unknowns.split(sizes, 1)
             u = u.unflatten(1, (-1, 3)) * self.equations.forces.free  # what no step changes is no unknown
             p = self.cavity.rest_pressure.expand_as(tau) if self.cavity.filling == "open" else pressure[:, 0]
-            after = self.step(State(u, p, moved), measured, tau, undamped)
+            after = self.step(State(u, p, moved), measured, tau, whole)
             return torch.cat([after.u.flatten(1), after.pressure[:, None], after.moved], 1)
 
         unknowns = torch.cat([state.u.flatten(1), state.pressure[:, None], state.moved], 1)
@@ -108,12 +105,6 @@ class GaussNewton(nn.Module):
     def is_native(self, *values: Any) -> bool:
         """Return whether machine code takes the steps of these tensors."""
         return self.equations.bearings.in_machine_code and takes(*values, self.equations.forces.elasticity.prestretch)
-
-    def objective(self, state: State, traction: Tensor, normal: Tensor, measured: MeasuredRays) -> Tensor:
-        """Return the objective of the last steps, `[B]`: the misfit of markers and gauge, and the loss of the tractions."""
-        terms: LossTerms = self.equations.loss(traction, normal, measured.noise_level)
-        angles = self.equations.bearings.angles(state.u, measured, state.moved)[0]
-        return self.misfit(angles, state.pressure, measured) + terms.others + terms.pushes
 
     def misfit(self, angles: Tensor, pressure: Tensor, measured: MeasuredRays) -> Tensor:
         """Return the part of the objective from markers with `angles [B, 2, D]`, and from a gauge, `[B]`."""
@@ -135,35 +126,24 @@ class GaussNewton(nn.Module):
         return traction
 
     @traced
-    def _begun(self, u: Tensor, pressure: Tensor, moved: Tensor, tau: float) -> tuple[Tensor, ...]:
+    def _begun(self, u: Tensor, pressure: Tensor, moved: Tensor, tau: float, left: float) -> tuple[Tensor, ...]:
         """Return the arguments of `_next` that it changes, before its first step."""
-        return torch.zeros_like(pressure, dtype=torch.bool), u, pressure, moved, u, torch.full_like(pressure, tau)
+        done = torch.zeros_like(pressure, dtype=torch.bool)
+        return done, u, pressure, moved, u, torch.full_like(pressure, tau), torch.full_like(pressure, left)
 
     @traced
     def _next(
-        self, done: Tensor, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, tau: Tensor, *of_markers: Any
+        self,
+        done: Tensor,
+        u: Tensor,
+        pressure: Tensor,
+        moved: Tensor,
+        before: Tensor,
+        tau: Tensor,
+        left: Tensor,
+        *of_markers: Any,
     ) -> tuple[Tensor, ...]:
-        """Take a step in every frame; return whether it has settled, the state, the displacement before, and the next `tau`."""
-        state = self._compiled_step(State(u, pressure, moved), MeasuredRays(*of_markers), tau, torch.zeros_like(tau))
-        step, last = self._scaled_step(u, state.u), self.settings.tau[1]
-        settled = ~((tau > last) | (step > self.settings.settled_step_tol))
-        return settled, *state, u, (tau * falling(step.clamp_min(LEAST_MOVE))).clamp_min(last)
-
-    @traced
-    def _none_better(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor) -> tuple[Tensor, ...]:
-        """Return the lowest objective so far, `[B]`, and its state, before the first step of `_next_keeping_best`.
-
-        Frames that have settled take none of its steps, and keep this state.
-        """
-        return torch.full_like(pressure, torch.inf), u, pressure, moved, before
-
-    @traced
-    def _next_keeping_best(
-        self, done: Tensor, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, lowest: Tensor, *others: Any
-    ) -> list[Tensor]:
-        """Take a damped step at the last `tau`, and keep the state with the lowest objective.
-
-        If a vertex is alternately pushed and pulled, not every step gives a usable solution.
+        """Take a step in every frame; return whether it has settled, the state, the displacement before, and the next `tau`.
 
         Args:
             done: whether a frame has settled, `[B]`.
@@ -171,44 +151,45 @@ class GaussNewton(nn.Module):
             pressure: current pressure, `[B]`.
             moved: current camera motion, `[B, 4 W]`.
             before: displacement before the last step, `[B, V, 3]`.
-            lowest: lowest objective so far, `[B]`.
-            others: the state that has it, with the displacement before it, and the measured rays.
+            tau: scale of the loss of compressive traction, `[B]`.
+            left: number of whole steps that are left, `[B]`, the last of what is returned. After these, steps are relaxed and
+                have the last `tau`.
+            of_markers: the measured rays.
         """
-        kept, measured = others[:4], MeasuredRays(*others[4:])
-        tau = torch.full_like(pressure, self.settings.tau[1])
-        state = self._compiled_step(State(u, pressure, moved), measured, tau, torch.full_like(tau, SETTLING_DAMPING))
-        objective = self.objective(state, *self.tractions(*state[:2]), measured)
-        settled = ~(self._scaled_step(u, state.u) > self.settings.settled_step_tol)
-        best = where_rows(objective < lowest, (objective, *state, u), (lowest, *kept))
-        return [settled, *state, u, *best]
+        last, is_whole = self.settings.tau[1], left > 0
+        tau, share = torch.where(is_whole, tau, last), torch.where(is_whole, 1.0, RELAXATION).to(tau)
+        state = self._compiled_step(State(u, pressure, moved), MeasuredRays(*of_markers), tau, share)
+        step = self._scaled_step(u, state.u)
+        settled = ~((tau > last) | (step > self.settings.settled_step_tol))
+        return settled, *state, u, (tau * falling(step.clamp_min(LEAST_MOVE))).clamp_min(last), left - 1
 
     def _scaled_step(self, u: Tensor, after: Tensor) -> Tensor:
         """Return the `scaled_step` between the displacements `u` and `after`, `[B, V, 3]` each, `[B]`."""
         moved, displacement = ((field.square().sum(-1).mean(-1).sqrt() / self.membrane.size) for field in (after - u, after))
         return scaled_step(moved, displacement)
 
-    def _compiled_step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> State:
+    def _compiled_step(self, state: State, measured: MeasuredRays, tau: Tensor, share: Tensor) -> State:
         """Take `step` as a region that `torch.compile` traces and compiles only once; the exporter does the same by itself.
 
         With gradients every step is traced: the gradients of a nested region have strides that torch 2.13 does not handle.
         """
         if torch.compiler.is_exporting() or torch.is_grad_enabled():
-            return self.step(state, measured, tau, damping)
-        return State(*self._nested_step(state, measured, tau, damping))
+            return self.step(state, measured, tau, share)
+        return State(*self._nested_step(state, measured, tau, share))
 
     @torch.compiler.nested_compile_region
-    def _nested_step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> tuple[Tensor, ...]:
+    def _nested_step(self, state: State, measured: MeasuredRays, tau: Tensor, share: Tensor) -> tuple[Tensor, ...]:
         """Return the tensors of `step` in a plain tuple: torch 2.13 traces a region that returns named tuples at every call."""
-        return tuple(self.step(state, measured, tau, damping))
+        return tuple(self.step(state, measured, tau, share))
 
-    def step(self, state: State, measured: MeasuredRays, tau: Tensor, damping: Tensor) -> State:
+    def step(self, state: State, measured: MeasuredRays, tau: Tensor, share: Tensor) -> State:
         """Take one reweighted Gauss-Newton step with linearised volume, limiting the stretch of an edge.
 
         Args:
             state: state before the step.
             measured: the markers' rays.
             tau: scale of the loss of compressive traction, `[B]`, on which the other scales depend.
-            damping: relative increase of the matrix's diagonal, `[B]`.
+            share: share of the step that is taken, `[B]`.
 
         Returns:
             The state after the step.
@@ -219,25 +200,25 @@ class GaussNewton(nn.Module):
         outlier = outlier_scale(torch.full_like(tau, settings.outlier), tau / last)
         _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
         loads = torch.cat([loads, motion.coupling], 1)
-        solved = self._solved(normal, loads, damping[:, None, None])
+        solved = self._solved(normal, loads)
         motion = motion.with_prior(moved, settings.camera_motion * blunt[:, None])
         products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
         shares = self._shares(u, pressure, products, corner)
         turn = (following @ shares[..., None])[..., 0]
         move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
-        share = self._share(u, move)
+        share = share * self._share(u, move)
         u = u + share[:, None, None] * move.flatten(2).mT
         return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn)
 
-    def _solved(self, normal: NormalEquations, loads: Tensor, damping: Tensor) -> Tensor:
-        """Return the solutions `[B, C, 3 N]` of the damped equations; gradients are those of the exact solution."""
+    def _solved(self, normal: NormalEquations, loads: Tensor) -> Tensor:
+        """Return the solutions `[B, C, 3 N]` of the equations; gradients are those of the exact solution."""
         equations = self.equations
         if torch.compiler.is_compiling():
-            return equations.system.substitute(equations.system.factor(equations.matrix(normal, damping)), loads)
+            return equations.system.substitute(equations.system.factor(equations.matrix(normal, 0.0)), loads)
         with torch.no_grad():
-            substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal, damping)))
-        return differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
+            substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal, 0.0)))
+        return differentiable(substitute, partial(equations.product, normal), loads)
 
     def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
         """Return the coefficients `[B, 3]` of the three loads' solutions in the negative step: the multiplier of the volume

@@ -27,9 +27,10 @@ LIGHT = 4e-4
 LEAST_MOVE = 1e-9
 """Relative displacement below which a surface stands still; keeps quotients finite."""
 SETTLING_STEPS = 8
-"""Number of damped steps for frames that have not settled before; at most half of all steps."""
-SETTLING_DAMPING = 1e-3
-"""Relative increase of the diagonal of the matrix in these steps."""
+"""Number of relaxed steps for frames that have not settled before; at most half of all steps."""
+RELAXATION = 0.5
+"""Share of these steps that is taken (the iteration of Krasnosel'skii and Mann). Where the weights jump between two values from
+step to step, whole steps would go to and fro for ever."""
 
 
 def scaled_step(moved: Scalar, displacement: Scalar) -> Scalar:
@@ -73,5 +74,5 @@ def outlier_scale(last: Scalar, ratio: Scalar) -> Scalar:
 
 
 def settling_of(steps: int) -> int:
-    """Return how many of at most `steps` steps are damped so that a frame settles."""
+    """Return how many of at most `steps` steps are relaxed so that a frame settles."""
     return min(SETTLING_STEPS, steps // 2)

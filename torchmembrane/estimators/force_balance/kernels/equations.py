@@ -132,7 +132,7 @@ class Workspace(NamedTuple):
 def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     """Return the arrays for a grid and a number of markers."""
     m, n = grid
-    N, V, P = (m - 2) * (n - 2), m * n, places(m, n)
+    N, P = (m - 2) * (n - 2), places(m, n)
     width = 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
     size, stride = storage(3 * N, width)
     shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, P), x=(3, P), cells=(CELLS, P), W=(3, 3, P))
@@ -268,7 +268,8 @@ def sum_blocks(c, work):
     for k in range(n + 1, V - n - 1, BYTES // A.itemsize):
         for s in range(7):
             at = k - STENCIL[s][0] * n - STENCIL[s][1]
-            of_s = _three(A, 3 * s * P + at, 21 * P), _three(A, (3 * s + 1) * P + at, 21 * P), _three(A, (3 * s + 2) * P + at, 21 * P)
+            own = 3 * s * P + at
+            of_s = _three(A, own, 21 * P), _three(A, own + P, 21 * P), _three(A, own + 2 * P, 21 * P)
             for other in range(s, 7):
                 for b in range(3):
                     b0, b1, b2 = _three(WA, (3 * other + b) * P + at, 21 * P)
@@ -302,8 +303,9 @@ def scale_rows(c, work, damping):
 
 @compiled
 def write_vertices(c, work, first, end, ridge, used):
-    """Write the rows of some vertices, from `first` up to `end`, of the matrix of the blocks to `U`, and of the first `used`
-    loads to `y`, scaled by `scale`, with the ridge added. Vertices after the last one have rows of zeros but on the diagonal."""
+    """Write the rows of the vertices from `first` up to `end`: those of the matrix of the blocks to `U`, and those of the first
+    `used` loads to `y`. They are scaled by `scale`, and the ridge is added. The rows behind those of the last vertex are zero but on the
+    diagonal."""
     n, U, sums, scale, stride = c.surface.free.shape[1], work.U, work.sums, work.scale, work.stride
     for k in range(first, end):
         row, at = 3 * k, (k // (n - 2) + 1) * n + k % (n - 2) + 1

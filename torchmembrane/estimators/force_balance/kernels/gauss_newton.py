@@ -13,10 +13,9 @@ from ....solve.native_band import COLUMNS, ROWS, backward, factor_rows, subtract
 from ....solve.symmetric_2x2 import symmetric_solution
 from ....vectors import BYTES
 from ..camera_motion import camera_stiffness
-from ..schedule import LEAST_MOVE, SETTLING_DAMPING, falling, outlier_scale, scaled_step
-from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, load_forces, scale_rows, sum_blocks, weigh, write_vertices
+from ..schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step
+from .equations import CAMERA, FLUID, FORCES, VOLUME, WANTED, load_forces, scale_rows, sum_blocks, weigh, write_vertices
 from .markers import load_markers
-from .solution import OBJECTIVE, TOLD, solution_of
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
 ratio_of_tau, scale_of_outliers, scaled = compiled(falling), compiled(outlier_scale), compiled(scaled_step)
@@ -26,32 +25,19 @@ PART = 64
 
 @compiled
 def settle(c, work, u, pressure, moved, before, seen, noise_level, gauge, tau, steps, settling):
-    """Take at most `steps` steps in place, the last `settling` of them as in `GaussNewton._next_keeping_best`; `before
-    [m, n, 3]` becomes the displacement before the last."""
+    """Take at most `steps` steps in place, the last `settling` of them relaxed, as `GaussNewton._next` does; `before [m, n, 3]`
+    becomes the displacement before the last."""
     k, done = c.numbers, False
     before[:] = u
-    for _ in range(steps - settling):
+    for j in range(steps):
         if not done:
             before[:] = u
-            step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, 0.0)
+            is_whole = j < steps - settling
+            tau = tau if is_whole else k.last_tau
+            step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, 1.0 if is_whole else RELAXATION)
             moved_by = _scaled_step(c, u, before)
             done = not (tau > k.last_tau or moved_by > k.settled_step_tol)
             tau = max(k.last_tau, tau * ratio_of_tau(max(moved_by, LEAST_MOVE)))
-    if done or settling == 0:
-        return
-    lowest, told = np.inf, np.empty(TOLD, u.dtype)
-    traction, reference = np.empty_like(u), np.empty(u.shape[:2], u.dtype)
-    best_u, best_pressure, best_moved, best_before = u.copy(), pressure.copy(), moved.copy(), before.copy()
-    for _ in range(settling):
-        if not done:
-            before[:] = u
-            step(c, work, u, pressure, moved, seen, noise_level, gauge, k.last_tau, SETTLING_DAMPING)
-            done = not _scaled_step(c, u, before) > k.settled_step_tol
-            solution_of(c, work, u, pressure, moved, before, seen, noise_level, gauge, 1.0, told, traction, reference)
-            if told[OBJECTIVE] < lowest:
-                lowest = told[OBJECTIVE]
-                best_u[:], best_pressure[:], best_moved[:], best_before[:] = u, pressure, moved, before
-    u[:], pressure[:], moved[:], before[:] = best_u, best_pressure, best_moved, best_before
 
 
 @compiled
@@ -68,8 +54,8 @@ def _scaled_step(c, u, before):
 
 
 @compiled
-def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, damping):
-    """Take one step in place: `u [m, n, 3]`, `pressure [1]` and `moved [4]` are overwritten."""
+def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, share):
+    """Take a share of one step in place: `u [m, n, 3]`, `pressure [1]` and `moved [4]` are overwritten."""
     (m, n), k = c.surface.free.shape, c.numbers
     outlier = scale_of_outliers(k.outlier, tau / k.last_tau)
     rise = linearise(c.surface, u, pressure, work.x, work.cells, work.force, work.A, work.volume) - c.numbers.rest_volume
@@ -78,7 +64,7 @@ def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, damping):
     fWv, vWv = load_forces(c, work)
     load_markers(c, work, u, moved, seen, outlier, own, slope)
     sum_blocks(c, work)
-    products = factored(c, work, damping, np.intp(WANTED))
+    products = factored(c, work, 0.0, np.intp(WANTED))
     following = _camera_eliminated(c.numbers, products, own, slope, moved, tau)
     multiplier, one, change = _shares(c.numbers, products, rise, pressure[0], fWv, vWv, gauge)
     shares, turn = np.zeros(WANTED, u.dtype), np.empty_like(moved)
@@ -88,7 +74,7 @@ def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, damping):
         shares[CAMERA + a] = turn[a]
     substituted(work, shares)
     move = work.solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
-    share = _share(c, u, move)
+    share *= _share(c, u, move)
     for i in range(m - 2):
         for j in range(n - 2):
             for a in range(3):
