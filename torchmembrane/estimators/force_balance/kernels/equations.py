@@ -304,8 +304,8 @@ def scale_rows(c, work, damping):
 @compiled
 def write_vertices(c, work, first, end, ridge, used):
     """Write the rows of the vertices from `first` up to `end`: those of the matrix of the blocks to `U`, and those of the first
-    `used` loads to `y`. They are scaled by `scale`, and the ridge is added. The rows behind those of the last vertex are zero but on the
-    diagonal."""
+    `used` loads to `y`. They are scaled by `scale`, and the ridge is added to the diagonal. The rows behind those of the last
+    vertex are zero but on the diagonal."""
     n, U, sums, scale, stride = c.surface.free.shape[1], work.U, work.sums, work.scale, work.stride
     for k in range(first, end):
         row, at = 3 * k, (k // (n - 2) + 1) * n + k % (n - 2) + 1
