@@ -169,7 +169,7 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     W = (root @ root.mT).movedim(1, -1)
     normal = equations.normal_equations(at, W, jacobian, weight)
     loads, (fWv, vWv) = equations.loads(normal, at, angle)
-    matrix, (volume, load, of_fluid) = equations.matrix(normal), loads.unbind(1)
+    matrix, (volume, load, of_fluid) = equations.matrix(normal, 1e-6), loads.unbind(1)
 
     moving = equations.forces.inner_free.repeat(3) > 0
     unknowns = torch.nonzero(moving).ravel()
@@ -197,8 +197,6 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     product = equations.product(normal, steps)[0].T
     torch.testing.assert_close(product[unknowns], (A.T @ W @ A + J.T @ w @ J) @ steps[0].T[unknowns])
     assert (product.count_nonzero(0) == len(unknowns)).all()
-    damped = equations.product(normal, steps, damping=0.25)[0].T - product
-    torch.testing.assert_close(damped[unknowns], 0.25 * (A.T @ W @ A + J.T @ w @ J).diagonal()[:, None] * steps[0].T[unknowns])
     of_camera = equations.motion(normal, measured, angle)
     K = motion[0].movedim(1, -1).flatten(0, 1)
     torch.testing.assert_close(of_camera.coupling[0, :, unknowns], K.T @ w @ J)

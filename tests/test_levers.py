@@ -156,13 +156,12 @@ def test_the_matrix_is_that_of_the_jacobian(equations):
     blocks = bearings.blocks(jacobian, weighted)
     one = torch.eye(3 * count).double().unflatten(1, (3, count))[None]
     torch.testing.assert_close(bearings.product(blocks, one)[0].flatten(1), dense, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(bearings.diagonal(blocks)[0].flatten(), dense.diagonal(), rtol=1e-9, atol=1e-9)
     tau, outlier = torch.tensor([[0.4], [2.5]]).double()
     at, normal, *_ = made.linearised(u, torch.tensor([0.02]).double(), still, measured, tau, outlier)
     loads = torch.rand(1, 2, 3 * count, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     loads = loads * made.forces.inner_free.repeat(3)
-    solved = made.system.substitute(made.system.factor(made.matrix(normal, 1e-3)), loads)
-    torch.testing.assert_close(made.product(normal, solved, 1e-3), loads, rtol=1e-6, atol=1e-6)
+    solved = made.system.substitute(made.system.factor(made.matrix(normal)), loads)
+    torch.testing.assert_close(made.product(normal, solved), loads, rtol=1e-6, atol=1e-6)
 
 
 def test_a_press_is_found_by_the_height_and_not_without_it(simulator, reconstructor, press):

@@ -215,9 +215,9 @@ class GaussNewton(nn.Module):
         """Return the solutions `[B, C, 3 N]` of the equations; gradients are those of the exact solution."""
         equations = self.equations
         if torch.compiler.is_compiling():
-            return equations.system.substitute(equations.system.factor(equations.matrix(normal, 0.0)), loads)
+            return equations.system.substitute(equations.system.factor(equations.matrix(normal)), loads)
         with torch.no_grad():
-            substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal, 0.0)))
+            substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal)))
         return differentiable(substitute, partial(equations.product, normal), loads)
 
     def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:

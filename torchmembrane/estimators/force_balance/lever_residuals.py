@@ -125,10 +125,6 @@ class LeverResiduals(MarkerResiduals):
         near: Tensor = each.unflatten(3, self.sources.shape).sum(-1).unflatten(3, (len(OFFSETS), -1))
         return near
 
-    def diagonal(self, blocks: Tensor) -> Tensor:
-        """Return the diagonal of `J^T w J` at the inner vertices, `[B, 3, N]`."""
-        return self.near(blocks)[:, :, :, 0].diagonal(dim1=1, dim2=2).mT
-
     def product(self, blocks: Tensor, u: Tensor) -> Tensor:
         """Return the products of `J^T w J` with fields `u [B, C, 3, N]`, from the blocks at `OFFSETS` and their transposes."""
         grid = self.grid[0] - 2, self.grid[1] - 2

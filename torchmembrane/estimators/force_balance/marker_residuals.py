@@ -217,11 +217,6 @@ class MarkerResiduals(nn.Module):
         near: Tensor = (blocks @ self.pair_shares).unflatten(-1, (len(NEAR), -1))
         return near
 
-    def diagonal(self, blocks: Tensor) -> Tensor:
-        """Return the diagonal of `J^T w J` at the inner vertices, `[B, 3, N]`."""
-        own: Tensor = blocks.diagonal(dim1=1, dim2=2).mT @ self.pair_shares[:, : self.vertex_shares.shape[1]]
-        return own
-
     def product(self, blocks: Tensor, u: Tensor) -> Tensor:
         """Return the products of `J^T w J` with fields `u [B, C, 3, N]`, `[B, C, 3, N]`."""
         shares = self.vertex_shares

@@ -6,7 +6,6 @@ Fields have their components first and the inner vertices, or the markers, last.
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...solve.stencil_system import Matrix, StencilSystem
@@ -17,7 +16,7 @@ from .robust import Cauchy
 from .traction_loss import TractionLoss
 
 DAMPING = 1e-6
-"""Default relative increase of the matrix's diagonal."""
+"""Relative increase of the matrix's diagonal for the standard deviations."""
 SLACK = 0.75
 """Rest tension relative to shear modulus x thickness (0.75 at a prestretch of 1.15) below which a sheet is solved in double
 precision. It is so compliant between its markers that rounding in float32 displaces it by per cents of a press."""
@@ -106,24 +105,13 @@ class BalanceEquations(nn.Module):
         own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
         return CameraMotion(coupling.flatten(2), own, slope)
 
-    def matrix(self, normal: NormalEquations, damping: float | Tensor = DAMPING) -> Matrix:
-        """Return `M` in the form that `system.factor` needs, with the relative increase `damping`, `[]` or `[B]`, of its
-        diagonal."""
+    def matrix(self, normal: NormalEquations, damping: float = 0.0) -> Matrix:
+        """Return `M` in the form that `system.factor` needs, with the relative increase `damping` of its diagonal."""
         near = self.bearings.near(normal.marker_blocks)
         return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 
-    def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
-        """Return `M u` for `u [B, C, 3 N]` without assembling the matrix; `damping` is as for `matrix`."""
-        if damping is not None:
-            return self.product(normal, u) + damping * self._diagonal(normal).flatten(1)[:, None] * u
+    def product(self, normal: NormalEquations, u: Tensor) -> Tensor:
+        """Return `M u` for `u [B, C, 3 N]` without assembling the matrix."""
         u, change = u.unflatten(-1, (3, -1)), self.forces.change
         of_forces = change(normal.stiffness, weighed(normal.weights[:, None], change(normal.stiffness, u)))
         return (of_forces + self.bearings.product(normal.marker_blocks, u)).flatten(2)
-
-    def _diagonal(self, normal: NormalEquations) -> Tensor:
-        """Return the diagonal of `M`, `[B, 3, N]`."""
-        A, (m, n) = normal.stiffness, self.forces.membrane.grid
-        squares = (A * (normal.weights[:, :, :, None, None] * A[:, None]).sum(2)).sum(1)
-        planes = squares.unflatten(-1, (m - 2, n - 2)).flatten(0, 1)
-        of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None], padding=1).reshape(-1, 3, squares.shape[-1])
-        return of_forces + self.bearings.diagonal(normal.marker_blocks)

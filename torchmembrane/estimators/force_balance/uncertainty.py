@@ -48,7 +48,7 @@ from .camera_motion import CameraMotion
 from .contact_force import Linearised
 from .gauss_newton import GaussNewton, State
 from .marker_residuals import MeasuredRays
-from .normal_equations import BalanceEquations, NormalEquations
+from .normal_equations import DAMPING, BalanceEquations, NormalEquations
 from .pressure_gauge import pulled
 from .settings import ForceBalanceSettings
 
@@ -97,7 +97,7 @@ def linearise(
     tau, outlier = (torch.full_like(state.pressure, scale) for scale in scales)
     at, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier, curvature=curvature)
     vWv = pulled(corner, measured.gauge, state.pressure - cavity.rest_pressure)[1]
-    factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
+    factor, membrane = equations.system.factor(equations.matrix(normal, DAMPING)), equations.forces.membrane
     compliance = cavity.condition(membrane.volume(membrane.rest + state.u) - membrane.rest_volume, state.pressure)[1]
     motion = motion.with_prior(state.moved, play)
     of_motion = equations.system.substitute(factor, motion.coupling)
