@@ -35,7 +35,7 @@ from .trace import EXPORTER, traced_model
 
 FORMAT = 1
 SEAL = "SHA-256: "
-CHECK, NODES = 0.85, 6_000  # for the default estimator: share of the time before the check, and traced nodes for each grid
+CHECK, NODES = 0.85, 3_600  # for the default estimator: share of the time before the check, and traced nodes for each grid
 IMAGE, PREVIOUS = "image", "previous_pixels"
 EXAMPLES = 2  # frames of the example inputs; the batch size of the model stays free
 
