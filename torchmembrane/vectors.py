@@ -17,7 +17,7 @@ from numba.extending import intrinsic, overload, register_model
 
 def _bytes() -> int:
     """Return the size of a vector: that of a register with AVX-512, else that of one with AVX2; other processors use two."""
-    features = config.CPU_FEATURES or binding.get_host_cpu_features().flatten()
+    features = binding.get_host_cpu_features().flatten() if config.CPU_FEATURES is None else config.CPU_FEATURES
     return 64 if "+avx512f" in features.split(",") else 32
 
 
