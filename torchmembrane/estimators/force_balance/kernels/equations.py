@@ -93,13 +93,13 @@ class Workspace(NamedTuple):
     A: Any
     """`[3, 21, P]`, the tangent stiffness, at the `places` of the vertices; as `weighted`."""
     x: Any
-    """`[3, P]`, and `cells [CELLS, P]`, for `linearise` to work in."""
+    """`[3, P]`, and `cells [CELLS, P]`, the working memory of `linearise`."""
     cells: Any
     weighted: Any
     W: Any
     """`[3, 3, P]`"""
     of_loads: Any
-    """`[3, 2, V]`, forces and the fluid's, weighted."""
+    """`[3, 2, P]`, forces and the fluid's, weighted."""
     sums: Any
     """`[90, P]`, blocks of the matrix."""
     normal: Any
@@ -117,9 +117,9 @@ class Workspace(NamedTuple):
     loads: Any
     """`[11, 3 N]`"""
     y: Any
-    """`[3 N x COLUMNS]`, loads, and then what `native_band` makes of them."""
+    """`[3 N x COLUMNS]`, the loads `b`, and then `U^-T b`."""
     solved: Any
-    """`[3 N]`, a sum of them."""
+    """`[3 N]`, the solution for a sum of the loads."""
     ridges: Any
     """`band.RIDGES`: a loop over an array is compiled once, over a tuple once for each of its numbers."""
     columns: Any
@@ -255,7 +255,7 @@ def _three(array, at, stride):
 
 @compiled
 def sum_blocks(c, work):
-    """Sum `A^T W A` and the markers' blocks in `sums [10 3 3, V]`: the blocks between the vertices and those at `OFFSETS`."""
+    """Sum `A^T W A` and the markers' blocks in `sums [10 3 3, P]`: the blocks between the vertices and those at `OFFSETS`."""
     (m, n), (corners, pulls) = c.surface.free.shape, c.corners
     V, P, sums, A, WA, W = m * n, work.A.shape[2], work.sums, work.A, work.weighted, work.W
     sums[:] = 0
