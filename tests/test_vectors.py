@@ -1,4 +1,4 @@
-"""Arithmetic with vectors in machine code is that of the numbers in them."""
+"""Vectors in machine code give the numbers of the formula."""
 
 import json
 import os
