@@ -16,6 +16,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import State
 from torchmembrane.estimators.force_balance.kernels import steps as native
+from torchmembrane.estimators.force_balance.kernels.equations import LOADS as LOADS_OF_DEVIATIONS
+from torchmembrane.estimators.force_balance.kernels.equations import WANTED
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.uncertainty import spreads_by_tensors
@@ -303,6 +305,19 @@ def test_what_needs_tensor_operations_is_left_to_them():
     torch.compile(lambda one: one + takes(one), backend="eager")(x)
     assert asked == [False]
     assert torch.compile(lambda one: one + takes(one), backend="eager")(x)[0] == 1
+
+
+def test_loads_that_a_step_does_not_have_are_zero():
+    """Those of the deviations are not left in memory, where every step would make them smaller, down to subnormal numbers."""
+    balance = estimator()
+    state, measured = problem(balance)
+    gauss_newton = balance.gauss_newton
+    gauss_newton.native.spread(gauss_newton.equations, gauss_newton.cavity, state, measured, 2.5)
+    (work,) = gauss_newton.native._idle[np.dtype(float)]
+    loads = work.y.reshape(-1, native_band.COLUMNS)
+    assert loads[:, WANTED:LOADS_OF_DEVIATIONS].any(0).all() and not loads[:, LOADS_OF_DEVIATIONS:].any()
+    taken(balance, state, measured)
+    assert loads[:, :WANTED].any(0).all() and not loads[:, WANTED:].any()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
