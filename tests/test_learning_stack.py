@@ -281,7 +281,7 @@ def test_frames_without_a_surface_pass_no_gradient_to_what_they_share(sensor, do
 def test_a_frame_that_has_not_converged_passes_finite_gradients(sensor, pixels, monkeypatch):
     """Markers far from any surface, so that the limits of what is plausible are lifted: they would be said first."""
     monkeypatch.setattr("torchmembrane.reconstruct.LARGEST_RESIDUAL", float("inf"))
-    few = tm.ForceBalanceSettings(steps=(8, 4, 4), largest_shared_misfit=100.0, largest_unexplained=100.0)
+    few = tm.ForceBalanceSettings(steps=(8, 4, 4), largest_shared_misfit=100.0, unexplained_per_displacement=1e5)
     reconstructor = tm.Reconstructor(sensor, settings=few, dtype=torch.float64)
     rest = reconstructor.rest_pixels
     leaf = (rest + 20 * (pixels[:1] - rest)).requires_grad_()

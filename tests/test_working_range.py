@@ -125,13 +125,13 @@ def test_a_sensor_file_s_range_is_taken_while_it_is_of_that_sensor(sensor, tmp_p
 def test_a_spec_sheet_s_range_ends_before_the_shallowest_wrong_press():
     presses = [trial(depth=depth, force=10 * depth, turn=20 * depth) for depth in (0.1, 1.0, 2.0, 3.0)]
     noisy = trial(depth=0.2, force=2.0, surface_error=0.9)  # so light that noise decides
-    assert working_range([*presses, noisy], 10.0, "f") == WorkingRange(0.3, 60.0, 30.0, "f")
+    assert working_range([*presses, noisy], 10.0, "f") == WorkingRange(0.3, GENERAL.turn, 30.0, "f")
     for wrong in (dict(surface_error=0.3), dict(force_error=0.3)):
         found = working_range([*presses, trial(depth=2.5, force=1.0, **wrong)], 10.0, "f")
-        assert found == WorkingRange(0.2, 60.0, 20.0, "f")
+        assert found == WorkingRange(0.2, GENERAL.turn, 20.0, "f")
     for fine in (dict(force_error=0.3, at_rim=True), dict(surface_error=0.3, status=7)):  # said of itself
         assert working_range([*presses, trial(depth=2.5, force=1.0, **fine)], 10.0, "f").depth == 0.3
-    assert working_range([trial(depth=3.0, turn=75.0)], 10.0, "f").turn == 75.0
+    assert working_range([trial(depth=3.0, turn=85.0)], 10.0, "f").turn == 85.0
     assert working_range([noisy], 10.0, "f") is None
 
 

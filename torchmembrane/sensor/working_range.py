@@ -79,7 +79,7 @@ def turn_cosine(normals: Tensor, rest: Tensor) -> Tensor:
     return cosine
 
 
-GENERAL = WorkingRange(depth=0.175, turn=60.0)
+GENERAL = WorkingRange(depth=0.3, turn=75.0)
 """Default range; `docs/accuracy.md` says on which sensors it was validated."""
 UNLIMITED = WorkingRange(depth=inf)
 

@@ -41,7 +41,6 @@ class ForceBalanceSettings:
         sparsity: twice the loss of the uniform compressive traction p0 on the whole surface, while the loss is quadratic.
         scale_share: share of the largest push (compressive traction) around a vertex, within `WIDER` times `reach`, below
             which a push is small.
-        far_share: the same as a share of the largest push on the whole surface.
         contact_noise: smallest ratio of a contact's push to the push due to noise; it must be large for its neighbourhood too.
         shear: weight of the loss of shear traction without a push, relative to that of compressive traction.
         slip: scale of the loss of shear traction, above which it is linear.
@@ -53,13 +52,13 @@ class ForceBalanceSettings:
             pressure). Use this value for better gauges as well.
         largest_stretch: largest relative change of an edge of the grid in one step.
         largest_relative_step: largest rms of the last step of a converged solution.
-        largest_volume_error: largest volume error of a converged solution, relative to the rest volume.
-        largest_unexplained: largest objective without the normal-compression term, per marker seen, that a surface of this
-            sensor explains; it is larger on grids of fewer than `force_balance.MIN_RESOLVED_LINES` lines.
-        unexplained_per_displacement: increase of this limit per displacement (rms): the grid's error grows with the press.
+        unexplained_per_displacement: largest objective without the normal-compression term, per marker seen, that a surface of
+            this sensor explains, above `estimator.LOSS_OF_NOISE` and per rms displacement: the error of grid and material
+            grows with the press.
         largest_shared_misfit: largest misfit that neighbouring markers have in common, in standard deviations, that a surface
             explains. A torn or sheared image moves neighbours alike, which no surface does. Relative to their limits, this and
-            the unexplained objective may add up to 1, because a skin that is not a membrane has some of both.
+            the unexplained objective may add up to 1, because a skin that is not a membrane has some of both. Both limits are
+            larger on grids of fewer than `estimator.MIN_RESOLVED_LINES` lines.
 
     Example:
         >>> ForceBalanceSettings(steps=(40, 20, 10)).far
@@ -72,7 +71,6 @@ class ForceBalanceSettings:
     camera_motion: float = 0.005
     sparsity: float = 9000.0
     scale_share: float = 0.2
-    far_share: float = 0.05
     contact_noise: float = 3.32
     shear: float = 3.75
     slip: float = 0.05
@@ -82,9 +80,7 @@ class ForceBalanceSettings:
     pressure_noise: float = 0.01
     largest_stretch: float = 0.3
     largest_relative_step: float = 2e-3
-    largest_volume_error: float = 1e-3
-    largest_unexplained: float = 2.0
-    unexplained_per_displacement: float = 30.0
+    unexplained_per_displacement: float = 60.0
     largest_shared_misfit: float = 1.35
 
     def __post_init__(self) -> None:
