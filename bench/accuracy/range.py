@@ -5,15 +5,14 @@ python -m bench.accuracy.range DATA... [--first 0] [--sensors 10000] [--only pre
 DATA from data/random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the
 force within a quarter of the true one, or said to be a lower bound, by `contact_at_rim`. Printed: shares right and wrong with
 status ok, and the rest by status, of presses whose contact is no narrower than the dots' spacing, by filling, prestretch, dots,
-view and depth, and of the narrower ones; how many that are right have a status; how many are out of range, by depth; how often
-`contact_at_rim` is said of contacts clear of the rim; errors of moment (length unit), patch force, slip ratio and curvature,
-median / 90 %; then what light strokes give, by the share of their largest force; then images at rest.
+view and depth, and of the narrower ones; how many that are right have a status; how often `contact_at_rim` is said of contacts
+clear of the rim; errors of moment (length unit), patch force, slip ratio and curvature, median / 90 %; then what light strokes
+give, by the share of their largest force; then images at rest.
 """
 
 import argparse
 import json
 import warnings
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -167,16 +166,6 @@ def line(name: str, rows: list[dict]) -> None:
     )
 
 
-def out_of_range(presses: list[dict]) -> None:
-    """What status 9 does, by depth: how many right presses get it, and how many of the wrong ones that were ok without it."""
-    for low, high in pairwise((0, 0.05, 0.1, 0.18, 0.2, 0.3)):
-        right, wrong = [], []
-        for row in (row for row in presses if low <= row["depth"] < high and row["status"] in (0, 9)):
-            (right if is_right(row) else wrong).append(row["status"] == 9)
-        said = f"{sum(right)} of {len(right)} right ones, {sum(wrong)} of {len(wrong)} wrong ones"
-        print(f"out of range, depth {low} to {high}: {said}")
-
-
 def report(rows: list[dict]) -> None:
     presses = [row for row in rows if row["kind"] == "press"]
     wide = [row for row in presses if row["width"] >= 1]
@@ -198,7 +187,6 @@ def report(rows: list[dict]) -> None:
                 chosen = [row for row in wide if low <= row[key] < high]
                 if chosen:
                     line(f"{key} {low} to {high}", chosen)
-        out_of_range(wide)
         off_rim = [row["at_rim"] for row in wide if row["clear"] > max(0.1, row["spacing"] / row["size"])]
         print(f"contact_at_rim of {len(off_rim)} contacts 0.1 of the size and a spacing clear of it: {np.mean(off_rim):.3f}")
         settled = [row for row in wide if row["status"] == 0 and row["clear"] > 0.1]

@@ -15,8 +15,6 @@ PRESSED = (*FRAME, "torchmembrane/simulate")
 JOBS = (*FRAME, "torchmembrane/jobs", "torchmembrane/files", "torchmembrane/results")
 FILES = ("torchmembrane/files", "torchmembrane/sensor", "bench/robustness/fuzz_kinds.py", "bench/robustness/malformed_files.py")
 SEEDS = (9001, 9002, 9003)
-OTHERS = (("a", 25, "--seed 481127"), ("b", 24, "--seed 271126"), ("c", 15, "--first 2000"), ("d", 189, "--seed 8126"))
-"""Random sensors on which no limit was chosen: folder, number, and which."""
 RANDOM_SENSORS = "bench.data.random_sensors DATA"
 MADE = {
     "cases": ("bench.data.cases CASES",),
@@ -25,7 +23,6 @@ MADE = {
     "gauge": (f"{RANDOM_SENSORS} --sensors 14 --presses 2 --light 8",),
     "intervals": tuple(f"{RANDOM_SENSORS}/{seed} --sensors 40 --presses 2 --light 6 --seed {seed}" for seed in SEEDS),
     "range": (f"{RANDOM_SENSORS} --sensors 160 --presses 4 --seed 8126",),
-    "out-of-range": tuple(f"{RANDOM_SENSORS}/{name} --sensors {number} {of}" for name, number, of in OTHERS),
     "degraded-images": (f"{RANDOM_SENSORS} --sensors 15",),
     "precision": (),
     "live-exported": (),
@@ -150,8 +147,5 @@ PARTS = {
     "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),
     "range": Part("bench.accuracy.range DATA", RANDOM, data="range"),
     "degraded-images": Part("bench.robustness.degraded_images DATA --sensors 4,8,14", RANDOM, data="degraded-images"),
-    "out-of-range": Part(
-        f"bench.accuracy.range {' '.join(f'DATA/{name}' for name, *_ in OTHERS)} --only press", RANDOM, data="out-of-range"
-    ),
 }
 """In the order in which they are measured, the quick ones first."""

@@ -1,6 +1,4 @@
-"""Tables of what is in and out of range: pins, presses that are too deep, and the limits at a glance."""
-
-from itertools import pairwise
+"""Tables of what is in and out of range: pins, and the limits at a glance."""
 
 import numpy as np
 
@@ -40,30 +38,6 @@ def pins_summary(results: dict) -> dict:
     return dict(groups=groups)
 
 
-def out_of_range(found: dict) -> Rows:
-    """How many right and wrong presses have status 9, by depth."""
-    rows = []
-    for row in found["bands"]:
-        counts = ["{} of {}".format(*row[key]) for key in ("right", "wrong")]
-        rows.append([f"{row['low']:g} to {row['high']:g}", *counts])
-    return [["depth of the press, over the size", "right presses with status 9", "wrong presses with status 9"], *rows]
-
-
-def out_of_range_summary(results: dict) -> dict:
-    """Counts of the presses that are no narrower than the dots' spacing and have status ok or 9."""
-    from bench.accuracy.range import is_right
-
-    presses = [row for row in results["rows"] if row["width"] >= 1 and row["status"] in (0, 9)]
-    bands = []
-    for low, high in pairwise((0, 0.05, 0.1, 0.18, 0.2, 0.3)):
-        counts = {}
-        for name, expected in (("right", True), ("wrong", False)):
-            statuses = [row["status"] for row in presses if low <= row["depth"] < high and is_right(row) == expected]
-            counts[name] = [statuses.count(9), len(statuses)]
-        bands.append(dict(low=low, high=high, **counts))
-    return dict(bands=bands)
-
-
 def by_depth(found: dict) -> tuple[dict[str, int], dict[str, int]]:
     """Of presses up to a fifth of the size deep, and of deeper ones: %, right with any status, right with ok, wrong with ok."""
     groups = found["groups"]
@@ -83,15 +57,14 @@ def readme_range(found: dict) -> str:
     (of, deep), every = by_depth(found), round(1 / found["groups"][0]["wrong"])
     return (
         f"Of the presses of random sensors that are up to a fifth of the membrane's size deep, {of['right']} % are right, "
-        f"{of['ok']} % with status `ok`. Nearly all deeper presses get another status, mostly 9 (out of range); of those up to "
-        f"0.3 of the size {deep['right']} % are right. Of all presses, one in {every} is wrong although its status is `ok`."
+        f"{of['ok']} % with status `ok`; of those from there to 0.3 of the size {deep['right']} % are right, {deep['ok']} % "
+        f"with status `ok`. Of all presses, one in {every} is wrong although its status is `ok`."
     )
 
 
-def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights: dict, checked: dict) -> Rows:
+def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights: dict) -> Rows:
     """What holds to which limit, from the records of the tables that say more."""
-    (of, deep), deepest = by_depth(range_), checked["bands"][-1]
-    unnoticed = (deepest["wrong"][1] - deepest["wrong"][0]) / (deepest["right"][1] + deepest["wrong"][1])
+    of, deep = by_depth(range_)
     firm = [row["force"][0] for row in light["bands"] if 0.05 <= row["low"] < 0.15]
     held = next(row for row in intervals_["bands"] if row["low"] is None)
     middle, most, largest = (f"{100 * value:.1f} %" for value in weights["errors"])
@@ -99,9 +72,8 @@ def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights:
         ["", "", "measured"],
         [
             "depth",
-            f"presses up to a fifth of the membrane's size: {of['right']} % are right; from there to 0.3: "
-            f"{deep['right']} %, nearly all with another status, mostly 9. {of['wrong']} % and {percent(unnoticed)} are wrong "
-            "with status ok",
+            f"presses up to a fifth of the membrane's size: {of['right']} % are right, {of['wrong']} % wrong with status ok; "
+            f"from there to 0.3: {deep['right']} % and {deep['wrong']} %; deeper ones have status 9",
             "[range](force_balance.md#range), [status 9](#range)",
         ],
         [
