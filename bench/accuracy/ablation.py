@@ -62,7 +62,7 @@ VARIANTS = [
     changed("compressive loss", "quadratic: tau = (10, 10)", tau=(10.0, 10.0)),
     changed("compressive loss", "not graduated: tau = (0.4, 0.4)", tau=(0.4, 0.4)),
     *each("compressive loss", "sparsity", BASE.sparsity / 4, BASE.sparsity * 4),
-    *each("what tractions are measured against", "scale_share", 0.1, 0.4),
+    *each("what tractions are measured against", "scale_share", BASE.scale_share / 2, BASE.scale_share * 2),
     *each("largest stretch in a step", "largest_stretch", 0.15, 0.6),
     *each("shear and friction", "shear", 0.0, BASE.shear / 4, BASE.shear * 4),
     *(Variant("shear and friction", f"friction = {mu:g}", friction=mu) for mu in (0.0, 0.25, 1.0)),
