@@ -70,7 +70,7 @@ class ForceBalanceSettings:
     settled_step_tol: float = 1e-4
     camera_motion: float = 0.005
     sparsity: float = 9000.0
-    scale_share: float = 0.14
+    scale_share: float = 0.2
     contact_noise: float = 3.32
     shear: float = 3.75
     slip: float = 0.05
