@@ -166,7 +166,7 @@ def test_a_schedule_is_that_of_tensor_operations(steps, tol, settle):
 
 def test_every_setting_is_heard_of():
     """Each changes a step, as it changes that of tensor operations."""
-    changed = dict(shear=2.0, slip=0.2, sparsity=900.0, floor=0.1, scale_share=0.9, contact_noise=220.0)
+    changed = dict(shear=2.0, slip=0.2, sparsity=900.0, floor=0.1, scale_share=0.9, far_share=0.8, contact_noise=220.0)
     changed |= dict(camera_motion=0.5, largest_stretch=1e-3, outlier=9.0)
     balance = estimator()
     given = problem(balance)

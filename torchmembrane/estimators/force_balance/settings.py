@@ -41,6 +41,7 @@ class ForceBalanceSettings:
         sparsity: twice the loss of the uniform compressive traction p0 on the whole surface, while the loss is quadratic.
         scale_share: share of the largest push (compressive traction) around a vertex, within `WIDER` times `reach`, below
             which a push is small.
+        far_share: the same as a share of the largest push on the whole surface.
         contact_noise: smallest ratio of a contact's push to the push due to noise; it must be large for its neighbourhood too.
         shear: weight of the loss of shear traction without a push, relative to that of compressive traction.
         slip: scale of the loss of shear traction, above which it is linear.
@@ -71,6 +72,7 @@ class ForceBalanceSettings:
     camera_motion: float = 0.005
     sparsity: float = 9000.0
     scale_share: float = 0.2
+    far_share: float = 0.05
     contact_noise: float = 3.32
     shear: float = 3.75
     slip: float = 0.05
@@ -80,7 +82,7 @@ class ForceBalanceSettings:
     pressure_noise: float = 0.01
     largest_stretch: float = 0.3
     largest_relative_step: float = 2e-3
-    unexplained_per_displacement: float = 60.0
+    unexplained_per_displacement: float = 40.0
     largest_shared_misfit: float = 1.35
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ the neighbourhood: `S` is the rms push over a Gaussian neighbourhood.
 A light touch, smeared over many vertices, pushes with far less than `p0`. Every traction is therefore measured relative to
 `rho p0` instead of `p0`, with
 
-    rho = min(1, max(c M, z sigma) / tau_last),
+    rho = min(1, max(c M, c_far max S, z sigma) / tau_last),
 
 the largest push `M` in a wider neighbourhood (a power mean of `S`), and the push `sigma` there due to the markers' noise alone.
 The loss is evaluated at `q / rho`, so that it is the same for light and strong touches, and noise below `z sigma` is never
@@ -124,7 +124,7 @@ class TractionLoss(nn.Module):
         top = compression2.amax(-1, keepdim=True).clamp_min(TINY)
         around = top * (((compression2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
         noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
-        expected = torch.maximum(settings.scale_share**2 * around, noise2)
+        expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
         least = (tau / last - 1).clamp(LEAST_SCALE, 1.0)[:, None]
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 

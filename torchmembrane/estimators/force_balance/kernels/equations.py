@@ -26,7 +26,7 @@ VOLUME, FORCES, FLUID, CAMERA, WANTED = 0, 1, 2, 3, 7
 """Loads: of the volume, the forces, the fluid, the camera's four motions, and in `spread` of four wanted numbers."""
 LOADS = WANTED + 4
 NOTHING = 1e-18
-"""Share of the largest push to the power `2 POWER` below which a vertex does not count in the mean around another."""
+"""Of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-5."""
 
 
 class Constants(NamedTuple):
@@ -69,6 +69,7 @@ class Numbers(NamedTuple):
     last_tau: float
     first_tau: float
     scale_share: float
+    far_share: float
     noise_share: float
     camera_motion: float
     settled_step_tol: float
@@ -179,7 +180,7 @@ def scaled(c, work, noise_level, tau):
     least = min(max(tau / k.last_tau - 1, LEAST_SCALE), 1.0) ** 2
     for i in range(N):
         expected = top * np.sqrt(np.sqrt(max(around[i], TINY))) * k.scale_share**2  # the root of POWER 4
-        expected = max(expected, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
+        expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
         around[i] = min(max(expected / k.last_tau**2, least), 1.0)
 
 
