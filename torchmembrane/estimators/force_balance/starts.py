@@ -15,10 +15,8 @@ from ..precision import rounded_to_float32
 from .gauss_newton import GaussNewton, State
 from .marker_residuals import MeasuredRays
 
-DEPTH = 0.1  # of the dent, relative to the surface's size
-WIDTH = 0.1  # of the dent (standard deviation), relative to the size
+DENT = 0.1  # depth of the dent and its width (standard deviation), relative to the surface's size
 REACH = 0.25  # radius of the neighbourhood whose pushes have a common middle, relative to the size
-FAINT_PUSH = 1.0  # relative to the push due to the markers' noise; a fainter push hardly dents the surface
 TINY = 1e-12  # squared push relative to the reference traction; keeps the middle finite without pushes
 
 
@@ -45,7 +43,8 @@ class InitialGuess(nn.Module):
 
     @traced
     def forward(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
-        """Return the state with dents near the centroids of the pushes, which are weighted by their squares."""
+        """Return the state with dents near the centroids of the pushes, which are weighted by their squares. Pushes that noise
+        explains hardly dent the surface."""
         membrane, loss = self.membrane, self.gauss_newton.equations.loss
         normals = membrane.normals(membrane.rest + u)
         q_n = (self.gauss_newton.traction(State(u, pressure, moved), measured) * normals).sum(-1, keepdim=True)
@@ -53,7 +52,7 @@ class InitialGuess(nn.Module):
         weight = (pad_border(compression2[..., None], membrane.grid)[..., 0] + TINY) * self.area
         middle = (weight[..., None] * membrane.rest).mT @ self.around / (weight @ self.around)[:, None]
         off2 = (middle.mT - membrane.rest).square().sum(-1) / membrane.size**2
-        faint2 = (FAINT_PUSH * measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
-        share = (compression2.amax(-1) / (compression2.amax(-1) + faint2))[:, None]
-        inwards = DEPTH * membrane.size * share * torch.exp(-off2 / (2 * WIDTH**2)) * self.free
+        noise2 = (measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
+        share = (compression2.amax(-1) / (compression2.amax(-1) + noise2))[:, None]
+        inwards = DENT * membrane.size * share * torch.exp(-off2 / (2 * DENT**2)) * self.free
         return State(u - inwards[..., None] * normals, pressure, moved)
