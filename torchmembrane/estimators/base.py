@@ -160,7 +160,7 @@ class StandardDeviations(NamedTuple):
     pressure: Tensor
 
     def known(self, frames: Tensor) -> "StandardDeviations":
-        """Return the deviations, with NaN in place of those outside `frames [B]`, bool."""
+        """Return the standard deviations, with NaN for every frame that is False in the mask `frames [B]`."""
         rows = ((value, frames.reshape(-1, *(1,) * (value.ndim - 1))) for value in self)
         return StandardDeviations(*(torch.where(row, value, torch.nan) for value, row in rows))
 
