@@ -73,8 +73,8 @@ def test_damaged_data_that_fill_a_strip_are_refused(tmp_path, code, further):
 
 
 @pytest.mark.parametrize("code, name", [(5, "tiff_lzw"), (32773, "packbits")])
-@pytest.mark.parametrize("rows, said", [(40, ""), (41, "another number of pixels"), (48, "another number of pixels")])
-def test_data_that_unpack_to_more_than_a_strip_are_refused(code, name, rows, said):
+@pytest.mark.parametrize("rows, is_whole", [(40, True), (41, False), (48, False)])
+def test_data_that_unpack_to_more_than_a_strip_are_refused(code, name, rows, is_whole):
     """A flipped bit makes a run longer: all that follows is pushed aside, and the decoder stops when the strip is full."""
     runs = np.repeat(PICTURE, 4, 1)[:, :48]
     longer = tiff(np.concatenate([runs, runs])[:rows], compression=name, tiffinfo={278: rows})
@@ -82,10 +82,10 @@ def test_data_that_unpack_to_more_than_a_strip_are_refused(code, name, rows, sai
     content = motorola(runs, code, longer[place : place + length])
     with Image.open(BytesIO(content)) as image:
         np.testing.assert_array_equal(np.asarray(image), runs)
-    if not said:
+    if is_whole:
         np.testing.assert_array_equal(np.rint(255 * decode_image(content, "a.tif")), runs)
         return
-    with pytest.raises(MembraneError, match=f"damaged data of a TIFF: they unpack to {said}"):
+    with pytest.raises(MembraneError, match="damaged data of a TIFF: the decompressed data have another size than the file declares"):
         decode_image(content, "a.tif")
 
 

@@ -117,9 +117,9 @@ def mismatched(found: dict) -> Rows:
         "5 %, screened, mean over all draws": "mean screened",
     }
     grown = {
-        "growth by 5 %, not screened: median, worst, draws over 20 %": "believed",
-        "growth by 5 %, screened": "screened",
-        "growth by other noise, nothing mismatched": "noise",
+        "growth of the error if 5 % are mismatched, not screened: median, worst, draws above 20 %": "believed",
+        "the same, screened": "screened",
+        "growth with another draw of the noise, none mismatched": "noise",
     }
     rows = [[text, *(f"{of[key]:.3f}" for of in each)] for text, key in lines.items()]
     rows += [[text, *(growth(of["growth"][key]) for of in each)] for text, key in grown.items()]

@@ -134,7 +134,7 @@ def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequen
 
 
 def _fit_camera(problem: "_BoardProblem", poses: np.ndarray, what: str) -> CameraFit:
-    """Solve the least-squares problem from its camera and `poses [P, 6]`, without outliers."""
+    """Solve the least-squares problem, starting from its camera and from `poses [P, 6]`; outliers are left out."""
     theta = np.concatenate([problem.start, poses.ravel()])
     problem.leave_out_unseen(theta)
     for _ in range(ROUNDS):

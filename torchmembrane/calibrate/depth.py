@@ -191,7 +191,8 @@ def _measured(sensor: Sensor, depth: np.ndarray) -> np.ndarray:
 
 
 def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points `[N, 3]` of every other row and column of pixels within the rim's outline, and their squares `[N]`."""
+    """Return the points `[N, 3]` for every other row and column of pixels within the rim's outline, and for each point the
+    number of the `CELL` x `CELL` px square of the image that contains its pixel, `[N]`."""
     mask = _measured(sensor, depth)
     mask[1::2] = mask[:, 1::2] = False
     v, u = np.nonzero(mask)

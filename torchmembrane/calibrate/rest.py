@@ -33,9 +33,9 @@ class RestFit(NamedTuple):
 
     Attributes:
         sensor: the sensor with the pose and dots found.
-        names: names of the parameters of the fit: six of the pose, and for an inflated surface height and prestretch.
+        names: names of the fitted parameters: the six of the pose and, if the surface is inflated, its height and prestretch.
         fit: fit of the pose relative to the design: rotation vector about the rim's centre (degrees), and offset (length
-            unit); for an inflated surface also of height and prestretch.
+            unit); if the surface is inflated, also of its height and prestretch.
         pixels: measured centres of the dots' outlines, `[D, 2]`, px; NaN where a dot is not visible.
         residuals: measured minus modelled pixels after the fit of the pose, `[D, 2]`.
         shifts: subsequent shifts of the dots along the surface that null the residuals, `[D, 3]`, length unit.

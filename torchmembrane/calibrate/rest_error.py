@@ -170,7 +170,7 @@ def height_told(
 
     All results are at two prestretches, one step below and one step above the lowest loss.
 
-    Near its minimum over the prestretch's logarithm `z` the loss is a parabola in both,
+    Near its minimum, the loss is quadratic in the logarithm `z` of the prestretch and in the height `h`,
     `z^2 / (2 variance) + k z h + g h + c h^2 / 2`; its minimum over `z` is `g h + (c - k^2 variance) h^2 / 2`. The prior adds
     `(h - mean)^2 / 2`.
 

@@ -84,7 +84,9 @@ def rest_from_view_images(
     """
     count = len(sensor.views)
     if count < 2 or len(images) != count:
-        raise MembraneError(f"calibrate rest: {len(images)} images of {count} views; expected one of each of two views or more")
+        raise MembraneError(
+            f"calibrate rest: {len(images)} images for {count} views; expected at least two views and one image for each"
+        )
     first = rest_from_image(sensor.in_view(0), images[0], overpressure, progress=within(progress, 0.0, 1 / count))
     views, further = list(sensor.views), []
     whole = replace(first.sensor, views=(replace(views[0], rest_image=images[0]), *views[1:]))

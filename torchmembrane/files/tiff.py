@@ -52,7 +52,7 @@ def refuse_damaged_page(tags: "ImageFileDirectory_v2", file: IO[bytes]) -> None:
             if compression in DEFLATED:
                 zlib.decompress(data)
             elif not (compression == LZW and OLD_LZW.match(data)) and sizes[compression](data) not in _sizes(tags, number):
-                raise ValueError("they unpack to another number of pixels")
+                raise ValueError("the decompressed data have another size than the file declares")
         except (zlib.error, ValueError) as error:
             raise ValueError(f"damaged data of a TIFF: {error}") from error
 

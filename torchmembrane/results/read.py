@@ -131,7 +131,8 @@ class Results:
 
     def __getitem__(self, name: str) -> Frame:
         if name not in self:
-            raise MembraneError(f"{self.folder}: no frame {name!r}; expected one of {len(self)}, {self.names[0]!r} the first")
+            first = f"the first of which is {self.names[0]!r}"
+            raise MembraneError(f"{self.folder}: no frame {name!r}; expected one of its {len(self)} frames, {first}")
         return self._read([name])[0]
 
     def __iter__(self) -> Iterator[Frame]:
