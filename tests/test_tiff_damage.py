@@ -85,7 +85,9 @@ def test_data_that_unpack_to_more_than_a_strip_are_refused(code, name, rows, is_
     if is_whole:
         np.testing.assert_array_equal(np.rint(255 * decode_image(content, "a.tif")), runs)
         return
-    with pytest.raises(MembraneError, match="damaged data of a TIFF: the decompressed data have another size than the file declares"):
+    with pytest.raises(
+        MembraneError, match="damaged data of a TIFF: the decompressed data have another size than the file declares"
+    ):
         decode_image(content, "a.tif")
 
 
