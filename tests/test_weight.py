@@ -103,7 +103,7 @@ BOTH_AT_RIM = {"contact_at_rim": torch.ones(3, 2), "contact_force": torch.tensor
         (BOTH_AT_RIM, "image 1: the press reaches the rim"),
         ({"contact_at_rim": torch.tensor([[0, 0], [1.0, 0], [0, 0]])}, "image 2: the press reaches the rim"),
         ({"force_deviation": torch.full((3, 3), 1.0)}, "image 1 shows a force whose relative error is 50 %;"),
-        ({"force_deviation": torch.full((3, 3), 0.2)}, "scale of forces to 5.8% only"),
+        ({"force_deviation": torch.full((3, 3), 0.2)}, "scale of forces only to 5.8%"),
         ({"status": torch.tensor([0, 0, 3])}, "image 3: the solve has not converged"),
         ({"force": torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 0.0, -4.0]])}, "image 3 shows"),
     ],

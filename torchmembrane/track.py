@@ -155,8 +155,8 @@ class Tracker:
         return self._compared(float(result.force[0].norm()), float(force), deviation if isfinite(deviation) else 0.0)
 
     def gauge(self, pressure_change: float) -> float:
-        """Compare the latest frame, taken without a `pressure`, with a gauge's pressure change since rest; otherwise as
-        `weigh`.
+        """Compare the pressure change of the latest frame, which was reconstructed without a `pressure`, with that of a gauge
+        since rest. Everything else is as in `weigh`.
 
         Args:
             pressure_change: measured change since rest, N / length^2, not zero.

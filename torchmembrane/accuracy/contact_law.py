@@ -122,7 +122,7 @@ def contact_law(sensor: Sensor, progress: Progress = silent) -> ContactLaw:
         progress: called with the completed share.
 
     Raises:
-        MembraneError: the sensor cannot be simulated, or too few presses can be followed.
+        MembraneError: the sensor cannot be simulated, or the simulator finds an equilibrium for too few presses.
 
     Limitations:
         Valid at the top for frictionless balls of radius 0.1 to 0.26 and depths up to 0.1 of the size. Away from the top,

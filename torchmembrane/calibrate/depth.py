@@ -31,7 +31,7 @@ class DepthFit(NamedTuple):
     Attributes:
         sensor: the sensor with the surface and the dots found.
         surface: the `Correction` of the designed surface.
-        projection: the averaged depths of N squares, projected onto the designed surface.
+        projection: projections of the measured depths onto the designed surface, averaged over each of N squares of the image.
         deviations: standard deviations of their signed distances, `[N]`, length unit.
     """
 

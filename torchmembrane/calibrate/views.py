@@ -203,7 +203,7 @@ class _Station(NamedTuple):
         return seen
 
     def project(self, points: Tensor) -> Tensor:
-        """Return the pixels of points `[..., 3]` given in this frame before `flip`."""
+        """Return the pixels of points `[..., 3]` in this image's frame, to which `flip` has not been applied."""
         pixels: Tensor = self.sensor.camera.point_to_pixel(points * torch.from_numpy(self.flip))
         return pixels
 

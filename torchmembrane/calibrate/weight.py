@@ -90,8 +90,8 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progr
     deviation = float((deviations**-2).sum() ** -0.5 * max(1.0, scatter))
     if deviation > SURE:
         raise MembraneError(
-            f"calibrate material: the weight determines the scale of forces to {deviation:.1%} only; expected {SURE:.0%} at "
-            "most, for forces right to a tenth: a heavier weight, or several photographs of it"
+            f"calibrate material: the weight determines the scale of forces only to {deviation:.1%}; expected {SURE:.0%} at "
+            "most, so that forces are accurate to 10 %: use a heavier weight, or take several photographs of it"
         )
     return WeightFit(made, material, forces, deviation)
 

@@ -126,7 +126,9 @@ def refuse_foreign(arguments: Namespace) -> None:
         if getattr(arguments, one) is not None and getattr(arguments, other) is not None:
             raise MembraneError(f"init: --{one} and --{other}; expected only one of them, because they are alternatives")
     if arguments.rim is not None and (arguments.rest is None or "radius" not in SHAPES[arguments.shape][:1]):
-        raise MembraneError("init: --rim; expected a round membrane (dome, cap, bubble) and the image it is read from, --rest")
+        raise MembraneError(
+            "init: --rim; expected also --rest, the image that shows the rim, and a round membrane (dome, cap, bubble)"
+        )
     if arguments.rim is not None and arguments.distance is not None and (arguments.focal or arguments.view):
         raise MembraneError("init: --rim, --distance and a focal length; expected two of them, which give the third")
 

@@ -233,7 +233,7 @@ def _unpacked(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     with file.open(member) as stream:
         content = stream.read(member.file_size + 1)
     if len(content) != member.file_size:
-        raise ValueError(f"{member.filename} holds {len(content)} bytes, its directory declares {member.file_size}")
+        raise ValueError(f"{member.filename} holds {len(content)} bytes, but the archive declares {member.file_size}")
     return content
 
 

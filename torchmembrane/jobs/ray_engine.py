@@ -35,7 +35,7 @@ class RayEngine:
         for source in waiting:
             if source.origin is not None:
                 raise MembraneError(
-                    f"{source.file}: --engine ray reads only image files with a single picture; leave it out for videos"
+                    f"{source.file}: --engine ray reads only image files with a single picture; leave out --engine for others"
                 )
             paths.append(printable(str(source.file)))
         if work.figures:

@@ -285,6 +285,6 @@ def _read_surface(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     lines = arrays["vertices" if "vertices" in arrays else "z"].shape[:2]
     if math.prod(lines) > MOST_VERTICES:
         raise MembraneError(
-            f"{path}: {' x '.join(map(str, lines))} vertices; expected at most {MOST_VERTICES}: take fewer lines"
+            f"{path}: {' x '.join(map(str, lines))} vertices; expected at most {MOST_VERTICES}: give a coarser grid"
         )
     return arrays

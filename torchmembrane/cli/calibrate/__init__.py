@@ -15,11 +15,17 @@ from ..choices import HEIGHT_ERROR, MOST_HEIGHT_ERROR, PORTS
 from ..progress import announce
 
 PURPOSE = "find lens, ports, rest surface and dots from images; make a layout of dots"
-CONTENT = """
+CALIBRATED = """
 SENSOR.toml may be preset:NAME. DIR then holds
   sensor.toml    the calibrated sensor, with its files
   report.json    the values found, their standard deviations and correlations
   report.png     a figure of the fit, with its residuals"""
+LAID_OUT = """
+SENSOR.toml may be preset:NAME. DIR then holds
+  sensor.toml    the sensor with these dots, with its files
+  layout.csv     the dots, for fabrication
+  layout.svg     the layout, for viewing
+  report.png     a figure of the layout"""
 ORDER = """\
 A sensor is calibrated in this order, each step starting from the sensor file of the one before:
   camera     finds the lens, from a checkerboard in air, before the ports are mounted
@@ -29,7 +35,7 @@ A sensor is calibrated in this order, each step starting from the sensor file of
   views      finds rest surface and dots from several views, if the dots are not listed
   depth      finds rest surface and dots from a depth image, if the dots are not listed
   material   finds the prestretch from images of presses, and the stiffness if forces or pressures of some are known
-The last step goes in the opposite direction:
+One further step goes in the opposite direction; it is used before the membrane is made:
   layout     computes positions on the rest surface, for fabrication, from the dots wanted in the image"""
 
 
@@ -44,7 +50,7 @@ def add_parser(commands: Any) -> None:
     )
     steps = parser.add_subparsers(title="steps", metavar="STEP", required=True)
     for name, step in STEPS.items():
-        example = f"example:\n  torchmembrane calibrate {name} {step.example}\n{CONTENT}"
+        example = f"example:\n  torchmembrane calibrate {name} {step.example}\n{LAID_OUT if name == 'layout' else CALIBRATED}"
         add = add_command(steps, name, partial(_run, step.module, name), step.purpose, example, *step.aliases)
         add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the preceding step")
         step.add_options(add)
@@ -151,7 +157,12 @@ def _depth_options(add: Add) -> None:
 
 
 def _material_options(add: Add) -> None:
-    add("images", metavar="IMAGES", nargs="+", help="images of deep presses: files, globs, folders")
+    add(
+        "images",
+        metavar="IMAGES",
+        nargs="+",
+        help="images of presses or of the known weight, with --pressure also one at rest",
+    )
     vectors, lengths = "CSV image,fx,fy,fz (on the membrane, in the camera's frame)", "image,force (magnitude)"
     table = (
         f"{vectors} or {lengths}, N: total force in some of the images; a column deviation with their standard "
