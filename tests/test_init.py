@@ -252,6 +252,11 @@ def test_a_rim_that_is_not_in_the_image_is_not_found():
         ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --overpressure 20hPa", "follows"),
         ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --rim 1,2,3", "--rest"),
         ("--shape dome --radius 12 --image-size 640,480 --view 100 --rim auto", "--rest"),
+        (
+            "--shape half_cylinder --radius 12 --length 30 --view 100 --rest rest.png --rim 9,9,5",
+            "circular rim (dome, cap, bubble)",
+        ),
+        ("--shape fingertip --semi-axes 9,7,9 --view 100 --rest rest.png --rim 9,9,5", "circular rim (dome, cap, bubble)"),
     ],
 )
 def test_what_is_missing_or_too_much_is_named(tmp_path, capsys, arguments, said):

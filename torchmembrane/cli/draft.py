@@ -27,6 +27,7 @@ from ..sensor.units import METRE
 from .choices import FROM_IMAGE
 
 ROUND = 0.95  # shorter over longer half axis of a rim, from which on it is taken for a circle
+CIRCULAR = ("dome", "cap", "bubble")  # shapes with a rim that is a circle
 LENGTHS = ("radius", "height", "semi_axes", "length", "half_angle", "size", "corner")
 
 
@@ -125,9 +126,9 @@ def refuse_foreign(arguments: Namespace) -> None:
     for one, other in (("focal", "view"), ("dots", "pitch"), ("rest", "pitch")):
         if getattr(arguments, one) is not None and getattr(arguments, other) is not None:
             raise MembraneError(f"init: --{one} and --{other}; expected only one of them, because they are alternatives")
-    if arguments.rim is not None and (arguments.rest is None or "radius" not in SHAPES[arguments.shape][:1]):
+    if arguments.rim is not None and (arguments.rest is None or arguments.shape not in CIRCULAR):
         raise MembraneError(
-            "init: --rim; expected also --rest, the image that shows the rim, and a round membrane (dome, cap, bubble)"
+            f"init: --rim; expected also --rest, the image that shows the rim, and a circular rim ({', '.join(CIRCULAR)})"
         )
     if arguments.rim is not None and arguments.distance is not None and (arguments.focal or arguments.view):
         raise MembraneError("init: --rim, --distance and a focal length; expected two of them, which give the third")

@@ -86,8 +86,8 @@ QUESTIONS = {
 }
 """Questions asked on a terminal, and the types of the answers."""
 INSTEAD = {
-    "distance": "; or --rim, the rim's circle in the rest image, with --view or --focal, which give it",
-    "view": "; or --focal, px; or --rim with --distance, which give it",
+    "distance": "; or --rim, the rim's circle in the rest image, if it is one, with --view or --focal, which give it",
+    "view": "; or --focal, px; or --rim with --distance, which give it, if the rim is a circle",
 }
 
 
