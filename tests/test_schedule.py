@@ -8,6 +8,7 @@ import torch
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import LOSS_OF_NOISE, ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import State
+from torchmembrane.estimators.force_balance.robust import Cauchy
 from torchmembrane.estimators.force_balance.schedule import (
     FIRM,
     LIGHT,
@@ -308,6 +309,13 @@ def test_pulls_and_neighbours_that_deviate_alike_add_up_but_for_a_rest_image_tha
     alike = share[:, 1] * SETTINGS.largest_shared_misfit
     found = found._replace(unexplained=pulls, shared_misfit=alike)
     assert one.is_explained(found).tolist() == [True, True, False, True, False, False]
+
+
+def test_noise_alone_leaves_a_loss_of_one_per_marker():
+    """While the loss is quadratic; that of large residuals grows more slowly."""
+    square = torch.randn(2, 100_000, generator=torch.Generator().manual_seed(0), dtype=torch.float64).square().sum(0)
+    assert Cauchy(1e4).loss(square).mean().item() == pytest.approx(LOSS_OF_NOISE, rel=0.01)
+    assert 0.7 < Cauchy(SETTINGS.outlier).loss(square).mean() < LOSS_OF_NOISE
 
 
 def test_a_press_may_leave_more_unexplained_than_a_sensor_at_rest(dented):
