@@ -66,7 +66,8 @@ def measure(path: Path, model: Path, convert, images: list, expected: list) -> d
     try:
         session = Session(path)
     except EdgeError as error:
-        return row | dict(not_loaded=str(error).splitlines()[0])
+        print(error)
+        return row | dict(not_loaded=True)
     found = [session.run(image) for image in images]
     row["milliseconds"] = min(milliseconds(session, images[0]) for _ in range(5))
     row["status"] = [int(result["status"][0]) for result in found]
