@@ -9,7 +9,7 @@ import torch
 import torchmembrane as tm
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
-from torchmembrane.estimators.force_balance.starts import DEPTH, REACH, WIDTH
+from torchmembrane.estimators.force_balance.starts import DENT, REACH
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate import Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
@@ -48,16 +48,16 @@ def vertex_near(x: float, y: float) -> int:
 
 @pytest.mark.parametrize("middles", [[vertex_near(0, 0)], [vertex_near(5, 0)], [vertex_near(-8, 0), vertex_near(8, 0)]])
 def test_the_middle_of_a_contact_is_dented_inwards_along_the_normals(estimator, middles):
-    """Nearly as deep as `DEPTH` says, half where another contact draws the middle aside; far from one, hardly at all."""
+    """Nearly as deep as `DENT` says, half where another contact draws the middle aside; far from one, hardly at all."""
     move, step = dented(estimator, middles), DOME.size / 16
     depth = -(move * DOME.rest_normals).sum(-1)
     torch.testing.assert_close(move, -depth[:, None] * DOME.rest_normals, rtol=0, atol=1e-9)
     distance = torch.cdist(DOME.rest, DOME.rest[middles])
     for near in distance.T:
         least = 0.75 if len(middles) == 1 else 0.5
-        assert least * DEPTH * DOME.size < depth[near < 1.5 * step].max() <= DEPTH * DOME.size
+        assert least * DENT * DOME.size < depth[near < 1.5 * step].max() <= DENT * DOME.size
     if len(middles) == 1:  # half way between two is a middle as well
-        assert depth[distance[:, 0] > 3 * WIDTH * DOME.size + 2 * step].max() < 0.1 * DEPTH * DOME.size
+        assert depth[distance[:, 0] > 3 * DENT * DOME.size + 2 * step].max() < 0.1 * DENT * DOME.size
     assert (depth[DOME.fixed] == 0).all()
 
 
@@ -65,7 +65,7 @@ def test_a_dent_is_a_bell_whose_standard_deviation_is_its_width(estimator):
     """Ridges of a contact's square around it: what its depth falls to at one and at one and a half widths."""
     vertex = vertex_near(0, 0)
     depth = -(dented(estimator, [vertex]) * DOME.rest_normals).sum(-1)
-    away = (DOME.rest - DOME.rest[vertex]).norm(dim=-1) / (WIDTH * DOME.size)
+    away = (DOME.rest - DOME.rest[vertex]).norm(dim=-1) / (DENT * DOME.size)
     near = (away > 0.5) & (away < 1.8)
     assert near.sum() > 12
     torch.testing.assert_close(depth[near] / depth.max(), torch.exp(-away[near].square() / 2), rtol=0.2, atol=0.02)
