@@ -91,7 +91,7 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progr
     if deviation > SURE:
         raise MembraneError(
             f"calibrate material: the weight determines the scale of forces only to {deviation:.1%}; expected {SURE:.0%} at "
-            "most, so that forces are accurate to 10 %: use a heavier weight, or take several photographs of it"
+            "most, so that forces are accurate to 10%: use a heavier weight, or take several photographs of it"
         )
     return WeightFit(made, material, forces, deviation)
 

@@ -15,13 +15,14 @@ from ..choices import HEIGHT_ERROR, MOST_HEIGHT_ERROR, PORTS
 from ..progress import announce
 
 PURPOSE = "find lens, ports, rest surface and dots from images; make a layout of dots"
-CALIBRATED = """
+CONTENT = """
 SENSOR.toml may be preset:NAME. DIR then holds
+"""
+CALIBRATED = """\
   sensor.toml    the calibrated sensor, with its files
   report.json    the values found, their standard deviations and correlations
   report.png     a figure of the fit, with its residuals"""
-LAID_OUT = """
-SENSOR.toml may be preset:NAME. DIR then holds
+LAID_OUT = """\
   sensor.toml    the sensor with these dots, with its files
   layout.csv     the dots, for fabrication
   layout.svg     the layout, for viewing
@@ -50,7 +51,8 @@ def add_parser(commands: Any) -> None:
     )
     steps = parser.add_subparsers(title="steps", metavar="STEP", required=True)
     for name, step in STEPS.items():
-        example = f"example:\n  torchmembrane calibrate {name} {step.example}\n{LAID_OUT if name == 'layout' else CALIBRATED}"
+        example = f"example:\n  torchmembrane calibrate {name} {step.example}\n{CONTENT}"
+        example += LAID_OUT if name == "layout" else CALIBRATED
         add = add_command(steps, name, partial(_run, step.module, name), step.purpose, example, *step.aliases)
         add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the preceding step")
         step.add_options(add)

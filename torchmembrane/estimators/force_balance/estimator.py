@@ -254,8 +254,10 @@ class ForceBalance(Estimator):
 
     @traced
     def is_converged(self, found: Equilibrium) -> Tensor:
-        """Return where the last step was short, `[B]` bool; it then fulfils the cavity's law, which the step linearises."""
-        return torch.logical_not(found.relative_step > self.settings.largest_relative_step)
+        """Return where the last step was short and the volume fulfils the cavity's law, `[B]` bool. A step of which only a part
+        was taken may be short and leave the law unfulfilled."""
+        error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
+        return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """Return where a surface of this sensor explains the markers, `[B]` bool: the objective without pushes, the misfit that

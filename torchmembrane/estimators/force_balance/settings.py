@@ -53,6 +53,7 @@ class ForceBalanceSettings:
             pressure). Use this value for better gauges as well.
         largest_stretch: largest relative change of an edge of the grid in one step.
         largest_relative_step: largest rms of the last step of a converged solution.
+        largest_volume_error: largest volume error of a converged solution, relative to the rest volume.
         unexplained_per_displacement: largest objective without the normal-compression term, per marker seen, that a surface of
             this sensor explains, above `estimator.LOSS_OF_NOISE` and per rms displacement: the error of grid and material
             grows with the press.
@@ -82,6 +83,7 @@ class ForceBalanceSettings:
     pressure_noise: float = 0.01
     largest_stretch: float = 0.3
     largest_relative_step: float = 2e-3
+    largest_volume_error: float = 1e-3
     unexplained_per_displacement: float = 40.0
     largest_shared_misfit: float = 1.35
 
