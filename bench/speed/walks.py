@@ -2,9 +2,9 @@
 
 python -m bench.speed.walks [--pages own_sensor,own_bubble] [--json FILE]
 
-The commands of the blocks ```sh of docs/PAGE.md are run in a folder that holds the tables of the page alone. Measured of each:
-The commands of the blocks ```sh of docs/PAGE.md are run in a folder that holds only the tables of the page. Measured of each:
-make what the reader has: the real sensor's file, and photographs. Machine code is in the cache if the page was run before.
+The commands of the blocks ```sh of docs/PAGE.md are run in a folder that holds only the tables of the page. Measured for each
+command: its user time and its wall-clock time. A row also says whether the command only stands in for what the reader already
+has, which are the file and the photographs of a real sensor. Machine code is in the cache if the page was run before.
 """
 
 import argparse

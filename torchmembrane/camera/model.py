@@ -289,7 +289,7 @@ def _check_count(model: str, distortion: list[float]) -> None:
     most, count = "k1 k2 k3 k4", len(distortion)
     if model == "pinhole":
         most = "k1 k2 p1 p2 k3, or these and k4 k5 k6"
-        expected = "0 after the eighth: thin prisms and tilt are not modelled, calibrate without them"
+        expected = "zeros after the eighth coefficient: thin prisms and tilt are not modelled, calibrate without them"
         expect(count not in FURTHER or not any(distortion[RATIONAL:]), "Camera: distortion", distortion, expected)
     fits = count <= COEFFICIENTS[model] or (model == "pinhole" and count in (RATIONAL, *FURTHER))
     expect(fits, "Camera: distortion", distortion, f"for a {model} at most {most}")
