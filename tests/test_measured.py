@@ -72,9 +72,9 @@ def commit(tmp_path, monkeypatch):
             ["git", *IDENTITY, *words], cwd=tmp_path, check=True, capture_output=True, text=True
         ).stdout.strip()
 
-    def change(name: str) -> str:
+    def change(name: str, added: str = "changed = 1") -> str:
         with (tmp_path / name).open("a") as file:
-            file.write("# changed\n")
+            file.write(added + "\n")
         git("add", name)
         git("commit", "--quiet", "--message", name)
         return git("rev-parse", "--short", "HEAD")
@@ -93,6 +93,31 @@ def test_a_table_says_that_it_is_old_once_its_paths_change(commit, tmp_path):
     (tmp_path / "measured.py").write_text("not committed")
     assert pages.uncommitted(("measured.py", "other.py")) == ["measured.py"]
     assert pages.changes_since("0000000", ("measured.py",)) == []
+
+
+def test_a_table_is_old_if_statements_have_changed_but_not_if_comments_or_docstrings_have(commit, tmp_path):
+    first = commit("a.py", "def f():\n    return 1")
+
+    def is_old() -> bool:
+        forget()
+        return bool(pages.changes_since(first, ("a.py", "b.txt")))
+
+    for said in ("# why", '"""What it is."""', ""):
+        commit("a.py", said)
+        assert not is_old()
+    commit("a.py", 'def g():\n    """What it does."""\n    return f() + 1')
+    assert is_old()
+    (tmp_path / "a.py").write_text("def f():\n    'One.'\n    return (1)\n")
+    commit("a.py", "")
+    assert not is_old()
+    commit("b.txt", "# other files count as they are")
+    assert is_old()
+
+
+def forget() -> None:
+    """Let git be asked again: another commit is the last one."""
+    pages.changes_since.cache_clear()
+    pages.program.cache_clear()
 
 
 MADE = """
@@ -119,7 +144,7 @@ def test_a_part_leaves_a_record_of_what_was_measured_where_and_when(commit, tmp_
     assert found["results"] == {"rows": [{"ms": 1.2346, "each": [1, 2]}]}
     assert not measure.is_due("made") and measure.state("made").endswith("; current")
     later = commit("made.py")
-    pages.changes_since.cache_clear()
+    forget()
     assert later != revision and measure.is_due("made") and "old: 1 commits" in measure.state("made")
 
 

@@ -3,6 +3,7 @@
 A page holds `<!-- measured: NAME -->`, a table or a paragraph, a line that says where it comes from, `<!-- end of NAME -->`.
 """
 
+import ast
 import json
 import re
 import subprocess
@@ -89,13 +90,40 @@ def aged(page: str, paths_of: dict[str, tuple[str, ...]]) -> str:
 
 @cache
 def changes_since(revision: str, paths: tuple[str, ...]) -> list[str]:
-    """Commits after a revision that changed any of the paths; none where git does not know the revision."""
-    command = ["git", "log", "--format=%h", "--no-merges", f"{revision}..HEAD", "--", *paths]
-    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    return found.stdout.split() if found.returncode == 0 else []
+    """Commits after a revision to files below the paths whose program differs now; none if git does not know the revision."""
+    names = git("diff", "--name-only", "--no-renames", revision, "HEAD", "--", *paths)
+    changed = [name for name in names.splitlines() if program(name, revision) != program(name, "HEAD")]
+    log = ("log", "--format=%h", "--no-merges", f"{revision}..HEAD", "--")
+    return git(*log, *changed).split() if changed else []
+
+
+@cache
+def program(name: str, revision: str) -> str:
+    """What a figure can depend on in a file: the statements of Python, without docstrings, comments and layout."""
+    text = git("show", f"{revision}:./{name}")
+    if not name.endswith(".py"):
+        return text
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(body := getattr(node, "body", None), list):
+            node.body = [each for each in body if not is_text(each)]
+    return ast.dump(tree)
+
+
+def is_text(statement: ast.AST) -> bool:
+    """Whether a statement is a docstring."""
+    match statement:
+        case ast.Expr(value=ast.Constant(value=str())):
+            return True
+    return False
+
+
+def git(*words: str) -> str:
+    """What git prints; nothing where it fails."""
+    found = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
+    return found.stdout if found.returncode == 0 else ""
 
 
 def uncommitted(paths: tuple[str, ...]) -> list[str]:
     """Files below the paths that differ from the last commit."""
-    command = ["git", "status", "--porcelain", "--", *paths]
-    return [line[3:] for line in subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()]
+    return [line[3:] for line in git("status", "--porcelain", "--", *paths).splitlines()]
