@@ -95,7 +95,7 @@ def test_a_table_says_that_it_is_old_once_its_paths_change(commit, tmp_path):
     assert pages.changes_since("0000000", ("measured.py",)) == []
 
 
-def test_a_table_is_old_if_statements_have_changed_but_not_if_comments_or_docstrings_have(commit, tmp_path):
+def test_a_table_is_old_if_statements_have_changed_but_not_if_texts_have(commit, tmp_path):
     first = commit("a.py", "def f():\n    return 1")
 
     def is_old() -> bool:
@@ -110,6 +110,14 @@ def test_a_table_is_old_if_statements_have_changed_but_not_if_comments_or_docstr
     (tmp_path / "a.py").write_text("def f():\n    'One.'\n    return (1)\n")
     commit("a.py", "")
     assert not is_old()
+    commit("a.py", "def h():\n    raise ValueError('no')")
+    second = commit("a.py", "")
+    source = (tmp_path / "a.py").read_text()
+    for words_of_error, raises in (("what was expected", "ValueError"), ("no", "TypeError")):
+        (tmp_path / "a.py").write_text(source.replace("ValueError('no')", f"{raises}({words_of_error!r})"))
+        commit("a.py", "")
+        forget()
+        assert bool(pages.changes_since(second, ("a.py",))) == (raises == "TypeError")
     commit("b.txt", "# other files count as they are")
     assert is_old()
 

@@ -107,7 +107,7 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
     command = ["reconstruct", str(gas_sensor), str(tmp_path / "run"), "--out", str(tmp_path / "out")]
     assert main([*command, "--bag", str(tmp_path / "forces")]) == 1  # the blank one has failed
     said = capsys.readouterr()
-    assert "messages of 2 frames" in said.out and "CameraInfo" not in said.err
+    assert "2 frames with a wrench" in said.out and "CameraInfo" not in said.err
     results = read_results(tmp_path / "out")
     assert results.names == [f"run_{k:06d}" for k in range(3)]
     stored = {each.suffix for each in (tmp_path / "forces").iterdir()}
@@ -210,7 +210,7 @@ def test_the_same_command_again_continues_and_its_bag_is_whole(tmp_path, gas_sen
     write_bag(run, StoragePlugin.MCAP, [(TOPIC, raw(k, pictures[2], "mono8")) for k in range(2)])
     assert main(command) == 0
     said = capsys.readouterr()
-    assert "changed, done again" in said.err and "messages of 2 frames" in said.out
+    assert "changed, done again" in said.err and "2 frames with a wrench" in said.out
     with AnyReader([forces]) as reader:
         assert reader.topics["/torchmembrane/wrench"].msgcount == 2
     assert sorted(each.name for each in tmp_path.iterdir()) == ["forces", "out", "run"]

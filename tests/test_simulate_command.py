@@ -169,12 +169,12 @@ def test_a_path_gives_frames_and_a_video(sensor_path, tmp_path, capsys):
 def test_a_data_set_goes_on_where_it_was_interrupted(sensor_path, tmp_path, capsys):
     call = ("simulate", sensor_path, "--random", "3", "--seed", "5", "--jobs", "1", "--noise", "35", "--out", tmp_path)
     code, said, _ = run(capsys, *call)
-    assert code == 0 and "3 made, 0 failed, 0 there before" in said
+    assert code == 0 and "3 made, 0 failed, 0 finished earlier" in said
     before = content(tmp_path)
     assert len({before[f"s5_00000{k}_truth.npz"] for k in range(3)}) == 3
     (tmp_path / "s5_000001.png").unlink()
     code, said, _ = run(capsys, *call)
-    assert code == 0 and "1 made, 0 failed, 2 there before" in said
+    assert code == 0 and "1 made, 0 failed, 2 finished earlier" in said
     assert content(tmp_path) == before
 
 
@@ -187,7 +187,7 @@ def test_processes_and_formats_do_not_change_a_data_set(sensor_path, tmp_path, c
     assert list(files) == list(rows) == ["s0_000000", "s0_000001"]
     for name in files:
         assert np.array_equal(files[name].image, rows[name].image) and same(files[name].truth, rows[name].truth)
-    assert "0 made, 0 failed, 2 there before" in run(capsys, *call, "--format", "parquet", "--out", tmp_path / "rows")[1]
+    assert "0 made, 0 failed, 2 finished earlier" in run(capsys, *call, "--format", "parquet", "--out", tmp_path / "rows")[1]
 
 
 @pytest.mark.parametrize("format", ["png", "parquet"])

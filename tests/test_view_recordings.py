@@ -137,7 +137,7 @@ def test_topics_of_the_views_are_matched_by_their_stamps(recorded, tmp_path, cap
     assert [int(frame["status"]) for frame in results] == [0, 0, 10, 0] and ": left (no picture" in said.err
     for n in (0, 1, 3):
         assert np.abs(results[f"run_00000{n}"]["vertices"] - expected[n]).max() < 5e-3
-    assert "messages of 4 frames in" in said.out
+    assert "4 frames with a wrench" in said.out
     for given, wanted in (
         ([], "expected the topic of each, --topic left=TOPIC --topic right=TOPIC"),
         (topics[:2], "a sensor of several views"),

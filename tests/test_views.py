@@ -114,11 +114,15 @@ def test_regions_share_one_image(press, found, tmp_path):
         ('name = "right"', 'name = "to the right"', "expected a name of letters"),
         ('name = "right"', 'name = "right"\nside = "beside"', '"inside" or "outside"'),
         ('name = "right"', 'name = "right"\nregion = [0, 0, 200, 120]', "within the calibrated image of 160 x 120"),
-        ('name = "right"', 'name = "right"\nregion = [0, 0, 160, 120]', "one of each view, or of none"),
+        (
+            'name = "right"',
+            'name = "right"\nregion = [0, 0, 160, 120]',
+            "View 'left': no region; expected one, as other views have one",
+        ),
         ('name = "left"', 'name = "left"\nside = "outside"', "'inside' of the first view"),
         ("[0.0, 1.0, 0.0, 0.0]", "[0.0, 2.0, 0.0, 0.0]", "orthogonal rows"),
         (", [0.0, 0.0, 0.0, 1.0]]", "]", "4 rows of 4 finite numbers"),
-        ("[markers]", '[markers]\nrest_image = "sensor_rest_left.png"', "give rest_image in each"),
+        ("[markers]", '[markers]\nrest_image = "sensor_rest_left.png"', "as view 'left' has no region: give each"),
     ],
 )
 def test_what_is_no_view_is_refused_in_words(press, tmp_path, old, new, said):

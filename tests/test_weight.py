@@ -149,7 +149,7 @@ def test_an_image_that_is_not_pressed_tells_no_modulus(tmp_path, capsys):
     for given in (["--weight", "2N"], [str(EXAMPLES / "flat_plate.png"), "--forces", str(tmp_path / "forces.csv")]):
         call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "rest.png"), *given]
         assert main([*call, "--out", str(tmp_path / "out")]) == 2
-        assert "image 1 shows hardly any force" in capsys.readouterr().err
+        assert "calibrate material: rest.png shows hardly any force" in capsys.readouterr().err
 
 
 def test_every_image_that_contradicts_the_others_is_named(monkeypatch):

@@ -1,8 +1,9 @@
 """Ctrl-C and SIGTERM end a command promptly, whatever it is doing.
 
-The first signal raises `Interrupted` in the main thread, as Python does for Ctrl-C. A watching thread ensures that this ends
-the command. If the exception is lost in a callback, it is raised again. If the main thread is in compiled code that does not
-return, or if a second signal arrives, the process is ended; its unfinished files are removed and its child processes are ended.
+The first signal raises `Interrupted` in the main thread, as Python raises KeyboardInterrupt for Ctrl-C. A watching thread
+ensures that this ends the command. If the exception is lost in a callback, it is raised again. If the main thread does not end
+in time, for instance because it is in compiled code that does not return, or if a second signal arrives, the process is ended;
+its unfinished files are removed and its child processes are ended.
 """
 
 import os

@@ -81,13 +81,13 @@ class Tracker:
 
         Args:
             frame: `[H, W]`, `[1 | 3, H, W]` or `[H, W, 1 | 3]`, or a batch of one as for `Reconstructor`; if views have
-                separate images, a list of these, or `[W, H, W']`.
+                separate images, a list of an image, or None, for each view, or an array `[views, H, W]` of grey images.
             pressure: measured pressure, as for `Reconstructor`.
             time: time of the frame, in seconds of any clock, later than the preceding frame's; kept in `time`.
 
         Raises:
-            MembraneError: there is more than one frame, the size, shape or type is wrong, or the time is not finite or not
-                later than the preceding frame's.
+            MembraneError: there is more than one frame, the size, shape or type is wrong, the time is not finite or not later
+                than the preceding frame's, or this sensor or estimator takes no pressure.
         """
         images = self._one(frame)
         expected = "seconds of any clock, a finite number"

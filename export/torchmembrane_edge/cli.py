@@ -67,9 +67,7 @@ def _checked(arguments: argparse.Namespace) -> list[Path]:
     """Return the image files, after all checks that do not need the model."""
     if arguments.camera is not None:
         if arguments.images or arguments.out:
-            raise EdgeError(
-                "--camera with images or --out; expected --camera alone, because the results of a camera are only printed"
-            )
+            raise EdgeError("--camera with images or --out; expected neither with --camera, whose results are only printed")
         if find_spec("cv2") is None:
             raise EdgeError('a camera needs OpenCV, which is not installed: pip install "torchmembrane-edge[camera]"')
         return []

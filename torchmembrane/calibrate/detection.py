@@ -65,7 +65,8 @@ def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
 
 
 def _other_board(grey: np.ndarray, board: Checkerboard) -> str:
-    """Return a hint for the message if the image shows a smaller board: the user may have counted squares, not corners."""
+    """Return a hint for the message if the image shows another board, of at least one corner less per row and column than
+    `board`: the user may have counted squares, not corners. Else return an empty text."""
     cv2, columns, rows = load_opencv(), board.columns - 1, board.rows - 1
     if min(columns, rows) < FEWEST_CORNERS:
         return ""

@@ -188,8 +188,9 @@ def _bent_intervals(
     least: float,
     scatter: float,
 ) -> np.ndarray:
-    """Return the intervals of shift and log modulus, `[2, 2]`, if logarithms of moduli are parabolas and all variances are
-    multiplied by `scatter`."""
+    """Return the 95 % intervals of the shift and of the log modulus, `[2, 2]`, with the evidence's log moduli modelled as
+    parabolas in the shift, and all variances multiplied by `scatter`. `about`: mean and standard deviation of the shift with
+    straight lines instead of parabolas; `least`: smallest possible shift."""
     t = _shifts(about[0], about[1] * scatter**0.5, least)
     best, off, covariance = _best(evidence, rows, values, t)
     weight, width = _probabilities(off, scatter), (scatter * covariance[0, 0]) ** 0.5

@@ -212,7 +212,7 @@ class Presses:
         for i in np.flatnonzero(known & unsure):
             raise MembraneError(
                 f"calibrate material: image {i + 1} shows hardly any force, although a force is given for it; expected presses "
-                "that dent the membrane visibly: leave it out"
+                "that dent the membrane visibly: leave out the image, or its force"
             )
 
     def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

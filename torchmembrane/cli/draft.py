@@ -131,7 +131,8 @@ def refuse_foreign(arguments: Namespace) -> None:
             f"init: --rim; expected also --rest, the image that shows the rim, and a circular rim ({', '.join(CIRCULAR)})"
         )
     if arguments.rim is not None and arguments.distance is not None and (arguments.focal or arguments.view):
-        raise MembraneError("init: --rim, --distance and a focal length; expected two of them, which give the third")
+        lens = "--focal" if arguments.focal else "--view"
+        raise MembraneError(f"init: --rim, --distance and {lens}; expected two of them, because they determine the third")
 
 
 def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:

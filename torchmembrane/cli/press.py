@@ -52,7 +52,7 @@ def simulate(arguments: Namespace) -> int:
     with ProgressDisplay("simulate --random") as progress:
         progress.begin("the sensor in the simulator")
         outcome = _random(arguments, Simulator(sensor, *options), progress)
-    print(f"presses: {outcome.made} made, {outcome.failed} failed, {outcome.skipped} there before; in {arguments.out}")
+    print(f"presses: {outcome.made} made, {outcome.failed} failed, {outcome.skipped} finished earlier; folder: {arguments.out}")
     return 1 if outcome.failed else 0
 
 

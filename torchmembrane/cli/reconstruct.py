@@ -171,7 +171,7 @@ def run(arguments: Namespace) -> int:
         pressure=pressure,
     )
     if bag is not None:
-        print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
+        print(f"{write_bag(bag, inputs, arguments.out)} frames with a wrench written to the bag {arguments.bag}")
     if arguments.video_out is not None:
         files = {frame_name(path): path for path in inputs.images}
         images = FrameImages(files, mesh, sensor.camera.bits)

@@ -174,7 +174,7 @@ def _check_options(arguments: Namespace) -> None:
         raise MembraneError("--name sensor_rest: the sensor's rest image has this name; expected another one")
     if arguments.random:
         if extra := given("depth", "slide", "path", "aim", "radius", "sides", "opening"):
-            raise MembraneError(f"--{extra[0]} does not go with --random, which draws presses at random: leave it out")
+            raise MembraneError(f"--{extra[0]} with --random, which draws the presses itself; expected only one of the two")
         return
     if missing := {"indenter", "depth"} - set(given("indenter", "depth")):
         raise MembraneError(f"--{sorted(missing)[0]} is missing; expected a press, as --indenter sphere --radius 4 --depth 2")

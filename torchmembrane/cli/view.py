@@ -125,10 +125,10 @@ def _plot(folders: list[Path], path: Path) -> None:
     from ..results.summary import read_summary
 
     runs = {str(folder): read_summary(folder) for folder in folders}
-    units = {(rows[0]["length_unit"], rows[0]["force_unit"]) for rows in runs.values()}
-    if len(units) > 1:
-        said = ", ".join(f"{force} and {length}" for length, force in sorted(units))
-        raise MembraneError(f"view --plot: results in {said}; expected folders with the same units")
+    units = {folder: f"{rows[0]['force_unit']} (force), {rows[0]['length_unit']} (length)" for folder, rows in runs.items()}
+    if len(set(units.values())) > 1:
+        said = "; ".join(f"{folder}: {unit}" for folder, unit in units.items())
+        raise MembraneError(f"view --plot: {said}; expected the same units in all folders")
     save(series_figure(runs), path, "view")
     print(f"{sum(map(len, runs.values()))} frames of {', '.join(runs)} drawn in {path}")
 

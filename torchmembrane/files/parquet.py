@@ -66,7 +66,7 @@ def nested(values: np.ndarray) -> Any:
 def refusal(path: Path, what: str, expected: str, error: object) -> MembraneError:
     """Return the error for a file that is not what it should be."""
     cause = in_one_line(str(error).removeprefix(f"{path}: "))
-    return MembraneError(f"{path}: not {what}, or damaged ({cause}); expected {expected}")
+    return MembraneError(f"{path}: not usable as {what} ({cause}); expected {expected}")
 
 
 def _declared_bytes(metadata: Any) -> int:

@@ -167,7 +167,10 @@ def _film(outline: Outline, cells: OutlineGrid) -> np.ndarray:
         if np.abs(w[free] - before).max() < FILM_SETTLED * outline.length:
             break
     else:
-        raise MembraneError("outline: no soap film was found in this rim; expected a less steep rim")
+        raise MembraneError(
+            "outline: the sheet before inflation (the surface of least area in the rim) was not found in "
+            f"{FILM_STEPS} steps; expected a flatter rim: points lie up to {np.abs(outline.heights).max():.3g} off its plane"
+        )
     return np.column_stack([x, w]).reshape(*cells.places.shape, 3)
 
 

@@ -115,10 +115,10 @@ def info_topic(topic: str) -> str:
 
 
 def mode_of(info: Any) -> Mode:
-    """Return the camera mode of a `sensor_msgs/CameraInfo`: `roi`, unless it is all 0, is cropped first, then `binning`
-    applies.
+    """Return the camera mode that a `sensor_msgs/CameraInfo` describes.
 
-    `width`, `height` and `k` refer to the calibrated image (REP 104).
+    The calibrated image is cropped to `roi`, unless that is all 0, and then binned. The message's `width`, `height` and `k`
+    refer to the calibrated image, before both (REP 104).
     """
     roi, binning = getattr(info, "roi", None), (getattr(info, "binning_x", 0) or 1, getattr(info, "binning_y", 0) or 1)
     left, top, width, height = (roi.x_offset, roi.y_offset, roi.width, roi.height) if roi is not None else (0, 0, 0, 0)

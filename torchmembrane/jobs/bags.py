@@ -46,7 +46,7 @@ def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstru
     if not inputs.bags:
         raise MembraneError(f"--bag {path}: none of the inputs is a bag; expected one, because the results take its times")
     if not reconstructor.finds_tractions:
-        raise MembraneError(f"--bag {path}: {mesh.estimator} finds no forces; expected force-balance")
+        raise MembraneError(f"--bag {path}: the estimator {mesh.estimator} finds no forces; expected --estimator force-balance")
     return BagWriter(path, SiUnits(mesh, reconstructor.sensor.gas_pressure), is_mcap(inputs.bags[0]))
 
 

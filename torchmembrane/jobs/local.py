@@ -79,15 +79,17 @@ def reconstruct_files(
         shard: part of the frames to reconstruct; several shards may run at the same time.
         engine: function that computes all outcomes from work, sources and batch, in place of the processes of this machine.
         figures: whether to write NAME.png for every frame; a finished frame without its figure is reconstructed again.
-        rest_pixels: markers at rest in this recording, `[D, 2]` px; default: those of the sensor's rest image.
+        rest_pixels: markers at rest in this recording, `[D, 2]` px, for W views `[W, D, 2]`; default: those of the rest image.
         pressure: gauge readings by frame name, or by name and time, in the units of `Reconstructor`.
-        report: function called with one line per failed frame (default: write it to stderr, above the progress bar).
+        report: function called with each message: on a frame that failed, lacks a view or is done again, and on views that were
+            left out or have moved (default: write it to stderr, above the progress bar).
 
     Returns:
         Numbers of reconstructed, failed and skipped frames.
 
     Raises:
-        MembraneError: `out` is refused, another job is writing there, or a package for videos or Parquet is missing.
+        MembraneError: `out` holds other files or results of another sensor or other settings, another job is writing there, or
+            a package for videos or Parquet is missing.
 
     Example:
         >>> import tempfile
@@ -122,9 +124,10 @@ def reconstruct_files(
                 folder.save()
                 progress.update(len(group), done)
     if alone := done[Status.VIEW_LEFT_OUT]:
-        report(f"a view was left out in {alone} frames, which are those of the others")
+        report(f"a view was left out in {alone} frames; their results are those of the other views")
     for view, frames in moved.items():
-        report(f"view {view}: its camera has moved since the rest image, in {frames} frames: `calibrate rest` with new ones")
+        moved_since = f"view {view}: its camera has moved since the rest image, in {frames} frames"
+        report(f"{moved_since}; run `calibrate rest` with new rest images")
     good = sum(done[status] for status in FINISHED)
     doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN], done[Status.OUT_OF_RANGE]
     return FrameCounts(good, *doubts, done.total() - good, progress.initial)

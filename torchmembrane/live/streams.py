@@ -97,7 +97,7 @@ class ModelStream:
         try:
             self._session = edge.Session(path, threads)
         except edge.EdgeError as error:
-            raise MembraneError(f"--model {error}") from error
+            raise MembraneError(f"--model {path}: {str(error).removeprefix(f'{path}: ')}") from error
         known = self._session.mesh
         if known["sensor"] != sensor:
             raise MembraneError(
@@ -124,7 +124,8 @@ class ModelStream:
         Raises:
             MembraneError: always, because the rest state is part of the model.
         """
-        raise MembraneError("rezero: an exported model contains a fixed rest state; leave --model out, or export it again")
+        remedy = "leave --model out, or run `calibrate rest` with new images and export the model again"
+        raise MembraneError(f"rezero: an exported model contains a fixed rest state; {remedy}")
 
     def weigh(self, force: float) -> str:
         """Raise an error, as `gauge` does.

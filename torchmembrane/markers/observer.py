@@ -238,7 +238,8 @@ class MarkerObserver(nn.Module):
         pixels = pixels[None] if pixels.ndim == 2 else pixels
         if pixels.shape[1:] != self.rest_pixels.shape:
             raise MembraneError(
-                f"from_pixels: pixels {list(pixels.shape)}; expected [B, {len(self.rest_pixels)}, 2], one for each marker"
+                f"from_pixels: pixels of shape {list(pixels.shape)}; expected [B, {len(self.rest_pixels)}, 2] or "
+                f"[{len(self.rest_pixels)}, 2], one pixel for each marker"
             )
         rest = self.rest_pixels if rest_pixels is None else self.rest_given(rest_pixels)
         finite = pixels.isfinite().all(-1)

@@ -57,7 +57,7 @@ class Strain(NamedTuple):
 class ElasticEnergy(nn.Module):
     """The membrane's elastic energy `U(x)`, with its gradient, and its stiffness along given directions.
 
-    harmonic       `W = mu/2 l^2 (I - 2)` (eq. 11 with the 1/2 and the area element that the printed formula lacks)
+    harmonic       `W = mu/2 l^2 (I - 2)` (eq. 11 of the paper, whose printed form lacks the factor 1/2 and the area element)
     neo_hookean    `W = mu/2 (l^2 I + 1 / (l^4 D) - 3)`
     mooney_rivlin  `W = C1 (I1 - 3) + C2 (I2 - 3)`, `I1 = l^2 I + 1 / (l^4 D)`, `I2 = l^4 D + I / (l^2 D)`, `2 (C1 + C2) = mu`
 

@@ -65,8 +65,8 @@ def rounding(reconstructor: Reconstructor, images: Tensor) -> float:
 
 
 def check_images(reconstructor: Reconstructor) -> Tensor:
-    """Simulate images of the sensor at rest, pressed, and at rest, `[3, 1, H, W]`; for W views with images of their own,
-    `[3, W, H, W']`. If the simulator finds no press, return a single image at rest."""
+    """Simulate images of the sensor at rest, pressed, and at rest, `[3, 1, height, width]`; for W views that have separate
+    images, `[3, W, height, width]`. If no press can be simulated, return only the first image."""
     simulator = Simulator(reconstructor.sensor)
     rest = simulator.images(simulator.membrane.rest, np.random.default_rng(REST_NOISE))
     frames: list[Any] = [rest]

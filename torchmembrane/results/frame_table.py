@@ -30,7 +30,7 @@ SAVE_SECONDS = 5.0
 """Longest time for which frames are buffered, s."""
 PART = re.compile(r"part-\d+")
 A_PART = "a part of torchmembrane's results"
-AS_WRITTEN = "it as it was written: the same reconstruct command again sets it aside and does its frames again"
+AS_WRITTEN = "the file as it was written: the same reconstruct command again sets it aside and does its frames again"
 COLUMNS = ("name", "status_text", *SourceFile._fields, "seconds", *Reconstruction._fields)
 
 

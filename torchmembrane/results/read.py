@@ -81,7 +81,8 @@ def read_frame(path: str | Path, name: str | None = None) -> FoundFrame:
         chosen = results.names[0] if name is None else name
         return FoundFrame(chosen, results[chosen], path)
     if path.suffix != ".parquet":
-        expect(name in (None, path.stem), "--frame", name, f"a folder or a part to choose from; {path} is one frame")
+        expected = f"{path.stem!r} or no name: {path} holds only this frame; to choose a frame, give a folder or a Parquet part"
+        expect(name in (None, path.stem), "name of the frame (--frame)", name, expected)
         return FoundFrame(path.stem, load_frame(path), path.parent)
     frames = read_part(path)
     first = min(frames, key=in_order)

@@ -95,7 +95,8 @@ def _write_table(path: Path, header: Iterable[str], rows: Iterable[dict[str, str
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    """Return the complete rows of an existing summary.csv; damaged rows and those with other columns are omitted."""
+    """Return the complete rows of summary.csv, without damaged rows and rows with other columns; none if the file is missing
+    or cannot be parsed as CSV."""
     try:
         regular_size(path, MOST_BYTES, EXPECTED)
         with open(path, newline="", encoding="utf-8", errors="replace") as file:

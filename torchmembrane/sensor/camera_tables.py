@@ -50,8 +50,8 @@ def with_rest_images(file: Table, views: list[View], markers: Markers) -> tuple[
     shared = markers.rest_image
     if shared is None:
         return views, replace(markers, rest_image=views[0].rest_image)
-    if any(view.region is None for view in views):
-        expected = "none for views with images of their own: give rest_image in each [[camera]]"
+    if apart := [view.name for view in views if view.region is None]:
+        expected = f"none, as view {apart[0]!r} has no region: give each [[camera]] a region, or a rest_image of its own"
         raise file.table("markers").refuse("rest_image", expected)
     return [replace(view, rest_image=view.camera.mode.image(shared)) for view in views], markers  # type: ignore[union-attr]
 

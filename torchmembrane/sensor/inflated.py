@@ -24,7 +24,7 @@ FORMULAS = ("rectangle", "ellipse")
 KEYS = ("outline", "size", "corner", "base_z", "height", "overpressure")
 MOST_PRESSURE = 1e6  # hPa
 MOST_RIM_BYTES = 2**20
-RIM_TABLE = Columns([("x", "y"), ("x", "y", "z")], "point of the rim, once around", least=3, most=MOST_POINTS)
+RIM_TABLE = Columns([("x", "y"), ("x", "y", "z")], "point", unit="in order once around the rim", least=3, most=MOST_POINTS)
 COORDINATE = Limit(FARTHEST, "a coordinate", "the length unit")
 
 

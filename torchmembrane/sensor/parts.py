@@ -199,11 +199,14 @@ class Markers:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The rest surface as the file describes it, before it is resampled to the solver grid.
+    """The rest surface as the sensor file describes it, before it is resampled to the solver grid.
 
     Args:
         shape: "grid" | "spherical_cap" | "ellipsoid_cap" | "half_cylinder" | "heightfield".
-        values: the numbers or arrays that describe this shape, by the keys of the file.
+        values: the numbers or arrays that describe this shape, by the keys of the sensor file.
+
+    Raises:
+        MembraneError: the shape is unknown, or the keys of `values` are not those of this shape.
 
     Example:
         >>> cap = Surface("spherical_cap", {"rim_radius": 12.0, "height": 9.0, "base_z": 15.0})

@@ -108,7 +108,9 @@ class Sensor:
             >>> sensor.in_view(0) is sensor
             True
         """
-        expect(0 <= number < max(1, len(self.views)), "Sensor.in_view: number", number, f"0 to {max(1, len(self.views)) - 1}")
+        count = max(1, len(self.views))
+        expected = "0, as the sensor has one view" if count == 1 else f"0 to {count - 1}, as the sensor has {count} views"
+        expect(0 <= number < count, "Sensor.in_view: number", number, expected)
         if number == 0:
             return replace(self, views=()) if self.views else self
         view, markers = self.views[number], self.markers

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..camera.model import Camera
-from ..errors import check_arguments, expect
+from ..errors import MembraneError, check_arguments, expect
 from ..files.images import read_image, to_grey
 from ..pose import ViewPose
 from ..surface.membrane import Membrane
@@ -145,8 +145,11 @@ def refuse_views(views: Sequence[View], has_listed_dots: bool) -> None:
     expect(views[0].side == SIDES[0], f"View {names[0]!r}: side", views[0].side, "'inside' of the first view: list it later")
     expect(has_listed_dots, "markers of several views", "none listed", "dots with their positions (`file`), seen by any view")
     parts = [view.region is not None for view in views]
-    expect(all(parts) or not any(parts), "region", "of some views", "one of each view, or of none")
-    wholes = [view.camera.mode.image_size for view in views if view.region is not None and view.camera.mode is not None]
-    for whole in wholes:
-        expected = f"{list(wholes[0])}, that of the first: regions are of one shared image"
-        expect(whole == wholes[0], "image_size of a view with a region", list(whole), expected)
+    if any(parts) and not all(parts):
+        without = names[parts.index(False)]
+        raise MembraneError(f"View {without!r}: no region; expected one, as other views have one, or none for all views")
+    wholes = {view.name: view.camera.mode.image_size for view in views if view.region is not None and view.camera.mode}
+    one = next(iter(wholes), "")
+    for name, whole in wholes.items():
+        expected = f"{list(wholes[one])}, as in view {one!r}: all regions are parts of one shared image"
+        expect(whole == wholes[one], f"View {name!r}: image_size", list(whole), expected)

@@ -62,10 +62,10 @@ class DatasetOutcome(NamedTuple):
 
 
 def random_frame(simulator: Simulator, plan: Plan, number: int) -> SimulatedFrame:
-    """Simulate the frame of a data set with the given number; strokes that the membrane cannot follow are drawn again.
+    """Simulate frame `number` of a data set; a stroke that the membrane cannot follow is replaced by another random one.
 
     Raises:
-        MembraneError: the membrane could follow none of `ATTEMPTS` strokes.
+        MembraneError: none of `ATTEMPTS` strokes could be drawn and followed by the membrane.
     """
     rng = np.random.default_rng([plan.seed, number])
     for _ in range(ATTEMPTS):

@@ -24,7 +24,7 @@ from .simulator import SimulatedFrame, Simulator
 
 SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"
 CONSTANT = ("dots_nominal", "uv_nominal", "visible_nominal", "vertices_nominal", "triangles", "p0")
-A_PART, AS_WRITTEN = "a part of simulated frames", "it as it was written: delete it and simulate its frames again"
+A_PART, AS_WRITTEN = "a part of simulated frames", "the file as it was written: delete it and simulate its frames again"
 A_TRUTH = "the truth of simulated frames"
 MOST_SETTINGS_BYTES = 2**20
 PART_ROWS = 64

@@ -85,7 +85,7 @@ class SimulatedFrame(NamedTuple):
     """An image with its ground truth.
 
     Attributes:
-        image: `[H, W]` uint8; with several views the first one's, or the image whose regions they are.
+        image: `[H, W]` uint8; with several views the first view's image, or, if they are regions of one image, that image.
         truth: arrays by name, see `Simulator.frame`.
         further: images of the other views, if views have separate images.
     """
@@ -147,7 +147,7 @@ class Simulator:
 
     def image(self, vertices: torch.Tensor, rng: np.random.Generator) -> np.ndarray:
         """Return the image of the membrane at `vertices [V, 3]`, uint8 `[H, W]`; `rng` generates the noise. With several views,
-        it is the first one's, or the image whose regions they are."""
+        it is the first view's image, or, if the views are regions of one image, that image."""
         return self.images(vertices, rng)[0]
 
     def images(self, vertices: torch.Tensor, rng: np.random.Generator) -> list[np.ndarray]:
@@ -210,7 +210,7 @@ class Simulator:
         for state in islice(states, 1, None):
             touched = touched or bool(state.contact.any())
             if self.leaves_camera(state.vertices):
-                raise MembraneError(f"simulate: {BEHIND}; expected a smaller depth")
+                raise MembraneError(f"simulate: {BEHIND} (depth {stroke.depth:g}); expected a smaller depth or slide")
             yield state
         if not touched:
             raise MembraneError("simulate: the indenter never touches the membrane; expected a depth that presses it in")

@@ -1,7 +1,7 @@
 """Implicit differentiation: gradients of solutions without differentiating the solver.
 
 A x = b, symmetric   dx = A^-1 (db - dA x)              `differentiable`
-x = T(x)             dx = (1 - dT/dx)^-1 dT             `differentiable_fixed_point`
+x = T(x)             dx = (1 - dT/dx)^-1 dT             `differentiable_fixed_point`, where dT is the change of T at fixed x
 """
 
 from collections.abc import Callable

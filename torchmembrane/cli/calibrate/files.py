@@ -185,14 +185,16 @@ def read_motions(path: Path) -> np.ndarray:
 
 
 def read_forces(path: Path, inputs: Inputs) -> KnownForces:
-    """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none, and their standard deviations.
+    """Return the known forces of the images, vectors `[B, 3]` in the camera's frame or magnitudes `[B, 1]`, N, NaN for images
+    that the table does not list; and their standard deviations `[B]`, N, or None if the table has none.
 
     Args:
-        path: path of a table of forces by the names of images.
+        path: path of the table, whose first column holds names of images.
         inputs: the B images.
 
     Raises:
-        MembraneError: another table, a name that is no image's, or a force of zero.
+        MembraneError: the table has other columns, a line names none of the images or one twice, a force is zero, or a
+            standard deviation is negative.
     """
     table = read_table(path, FORCES, MOST_TABLE_BYTES)
     columns = table.form[1:]

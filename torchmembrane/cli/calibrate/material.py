@@ -2,6 +2,8 @@
 
 import re
 from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from ...calibrate.presses import STRETCHES
 from ...calibrate.report import Report
 from ...calibrate.view_poses import with_found
 from ...calibrate.weight import WeightFit, material_from_weight
+from ...errors import MembraneError
 from ...files.timestamps import time_in
 from ...jobs.inputs import Inputs, find_inputs, frame_name, of_first_view, single_images
 from ...jobs.pressure import read_pressures
@@ -34,7 +37,7 @@ def material(arguments: Namespace) -> int:
     forces = known_forces(arguments, inputs)
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, whole) for path in paths]))[:, None]
-    with ProgressDisplay("calibrate material") as progress:
+    with _named(paths), ProgressDisplay("calibrate material") as progress:
         weighed = material_from_weight(sensor, images, arguments.weight, progress=progress) if alone else None
         known = dict(overpressure=arguments.overpressure, rest_error=arguments.rest_error, progress=progress)
         found = material_from_images(sensor, images, forces, pressures, **known) if weighed is None else weighed.material
@@ -90,7 +93,16 @@ def _of_forces(arguments: Namespace, found: MaterialFit, weighed: WeightFit | No
 
 def _by_name(sentence: str, paths: list[Path]) -> str:
     """A sentence about `image N` with that image's name."""
-    return re.sub(r"^image (\d+)", lambda match: paths[int(match[1]) - 1].name, sentence)
+    return re.sub(r"\bimage (\d+)", lambda match: paths[int(match[1]) - 1].name, sentence)
+
+
+@contextmanager
+def _named(paths: list[Path]) -> Iterator[None]:
+    """Let errors name the files of the images instead of their numbers."""
+    try:
+        yield
+    except MembraneError as error:
+        raise MembraneError(_by_name(str(error), paths)) from error
 
 
 def _doubted(sensor: Sensor, images: torch.Tensor, paths: list[Path]) -> list[str]:

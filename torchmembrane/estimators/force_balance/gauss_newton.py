@@ -103,7 +103,7 @@ class GaussNewton(nn.Module):
         return State(u.unflatten(1, (-1, 3)), pressure[:, 0], moved)
 
     def is_native(self, *values: Any) -> bool:
-        """Return whether machine code takes the steps of these tensors."""
+        """Return whether machine code, instead of tensor operations, can compute the steps for these tensors."""
         return self.equations.bearings.in_machine_code and takes(*values, self.equations.forces.elasticity.prestretch)
 
     def misfit(self, angles: Tensor, pressure: Tensor, measured: MeasuredRays) -> Tensor:

@@ -1,4 +1,4 @@
-"""Assignment of blobs to dots in which neighbours agree on their motion: belief propagation on the pattern's triangles."""
+"""Assignment of blobs to dots in which neighbours agree on their motion: belief propagation between neighbours."""
 
 from math import log
 

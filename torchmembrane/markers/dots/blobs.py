@@ -117,7 +117,8 @@ def check_count(count: int) -> None:
     """Refuse fewer than `FEWEST` dots."""
     if count < FEWEST:
         raise MembraneError(
-            f"find_dots: {count} dots found, expected at least {FEWEST}; check the polarity, the rest image and the mask"
+            f"find_dots: {count} dots found, expected at least {FEWEST}; check focus and light, whether the dots are dark or "
+            "light (polarity), and the mask if there is one"
         )
 
 

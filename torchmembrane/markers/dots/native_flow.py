@@ -49,7 +49,7 @@ def _gradient(c, weight, flow, prior, rows, sums, gradient):
 
 @compiled
 def _along(c, weight, flow, gradient, fields, rows, sums, found):
-    """Apply `FlowAverages.along` to one frame; `found [3, D]` has the flow and the support."""
+    """Apply `FlowAverages.along` to one frame: write the flow and the support to `found [3, D]`."""
     _, moments, still, _, _, h = c
     count = len(h)
     for d in range(count):

@@ -11,18 +11,19 @@ WEAKEST_GRADIENT = 0.01  # grey per px, rms over the patch in its weakest direct
 
 
 def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np.ndarray:
-    """Choose the patches to follow: corners with a well-conditioned structure tensor, spread evenly.
+    """Choose the patches to follow: the pixels with the strongest gradients in two directions, spread evenly and at least 5 px
+    from the edge of the mask.
 
     Args:
         image: rest image `[H, W]`, grey in 0..1.
         mask: `[H, W]` bool, where the membrane is visible.
-        count: number of patches if all of the mask were textured.
+        count: approximate number of patches if all of the mask is textured.
 
     Returns:
-        Patch centres `[D, 2]`, px, the best conditioned first.
+        Patch centres `[D, 2]`, px, in decreasing order of the structure tensor's smaller eigenvalue.
 
     Raises:
-        MembraneError: image and mask differ in shape, or fewer than 30 places have texture in two directions.
+        MembraneError: image and mask are not `[H, W]` of one size, or fewer than 30 patches are found.
 
     Example:
         >>> image = np.random.default_rng(0).random((120, 160))

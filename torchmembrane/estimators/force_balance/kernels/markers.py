@@ -1,4 +1,5 @@
-"""The markers' angles for one frame as machine code, and their contributions to the equations of a step.
+"""Machine code for one frame: the angles between the markers and their measured rays, and what they contribute to the equations
+of a Gauss-Newton step.
 
 The formulas repeat those of `MarkerResiduals`; a test compares the numbers.
 """

@@ -46,7 +46,7 @@ class Strip:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS or not self.prestretch >= 1 or not self.modulus > 0:
-            raise MembraneError(f"Strip: {self}; expected model {' or '.join(MODELS)}, prestretch >= 1 and modulus > 0")
+            raise MembraneError(f"{self}; expected model {' or '.join(MODELS)}, prestretch >= 1 and modulus > 0")
 
     def density(self, s2: Tensor) -> Tensor:
         """Return the energy per rest length, a force, for the squared stretch `s2 [...]`."""
