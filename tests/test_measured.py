@@ -135,17 +135,22 @@ json.dump(dict(machine=machine, rows=[dict(ms=1.2345678, each=[1, 2])]), open(sy
 """
 
 
-def test_a_part_leaves_a_record_of_what_was_measured_where_and_when(commit, tmp_path, monkeypatch):
-    for name, value in dict(ROOT=tmp_path, RECORDS=tmp_path / "records", OUT=Path("out")).items():
+def recorded_in(folder: Path, monkeypatch: pytest.MonkeyPatch, part: Part) -> None:
+    """Let one part, `made`, be measured in a folder."""
+    for name, value in dict(ROOT=folder, RECORDS=folder / "records", OUT=Path("out")).items():
         monkeypatch.setattr(measure, name, value)
-    monkeypatch.setattr(pages, "RECORDS", tmp_path / "records")
-    monkeypatch.setattr(measure, "PARTS", {"made": Part("made --turns 5", ())})
-    (tmp_path / "made.py").write_text(MADE)
+    monkeypatch.setattr(pages, "RECORDS", folder / "records")
+    monkeypatch.setattr(measure, "PARTS", {"made": part})
+    (folder / "made.py").write_text(MADE)
+    (folder / "out").mkdir()
+
+
+def test_a_part_leaves_a_record_of_what_was_measured_where_and_when(commit, tmp_path, monkeypatch):
+    recorded_in(tmp_path, monkeypatch, Part("made --turns 5", ()))
     with pytest.raises(SystemExit, match=r"commit made\.py first"):
         measure.measure("made", None)
     assert measure.is_due("made") and measure.state("made") == "never measured"
     revision = commit("made.py")
-    (tmp_path / "out").mkdir()
     measure.measure("made", None)
     found = pages.record("made")
     assert found["command"] == "python -m made --turns 5" and found["revision"] == revision and found["processor"] == "A"
@@ -154,6 +159,19 @@ def test_a_part_leaves_a_record_of_what_was_measured_where_and_when(commit, tmp_
     later = commit("made.py")
     forget()
     assert later != revision and measure.is_due("made") and "old: 1 commits" in measure.state("made")
+
+
+def test_the_latest_results_of_other_processors_are_kept(commit, tmp_path, monkeypatch):
+    recorded_in(tmp_path, monkeypatch, Part("made", (), by_processor=True))
+    revisions = {}
+    for processor in "ABA":
+        (tmp_path / "made.py").write_text(MADE.replace('processor="A"', f"processor={processor!r}"))
+        revisions[processor] = commit("made.py", f"# {len(revisions)}")
+        measure.measure("made", None)
+    found = pages.record("made")
+    assert found["processor"] == "A" and list(found["results"]) == ["A", "B"]
+    assert {name: each["revision"] for name, each in found["results"].items()} == revisions
+    assert found["results"]["B"]["rows"] == [{"ms": 1.2346, "each": [1, 2]}]
 
 
 def drifts(part, **of):

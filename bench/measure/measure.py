@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from bench.measure.pages import PAGES, RECORDS, ROOT, block, blocks, changes_since, filled, record, uncommitted
+from bench.measure.pages import PAGES, RECORDS, ROOT, block, blocks, changes_since, filled, git, record, uncommitted
 from bench.measure.parts import MADE, PARTS, words
 from bench.measure.tables import FIGURES, SUMMARIES, TABLES
 
@@ -91,21 +91,29 @@ def measure(name: str, independent: Path | None) -> None:
         subprocess.run(called, cwd=ROOT, check=True, env=os.environ | ENVIRONMENT)
     results = json.loads((ROOT / result).read_text())
     machine, seconds = results.pop("machine"), time.perf_counter() - began
+    revision = git("rev-parse", "--short=7", "HEAD").strip()
+    processor = machine["cuda"] if part.needs_gpu else machine["processor"]
+    results = SUMMARIES[name](results) if name in SUMMARIES else results
     found = dict(
         command=part.shown,
-        revision=subprocess.run(
-            ["git", "rev-parse", "--short=7", "HEAD"], cwd=ROOT, capture_output=True, text=True
-        ).stdout.strip(),
+        revision=revision,
         date=datetime.date.today().isoformat(),
-        processor=machine["cuda"] if part.needs_gpu else machine["processor"],
+        processor=processor,
         cores=os.cpu_count(),
         load=max(load, os.getloadavg()[0]),
         seconds=round(seconds),
         torch=machine["torch"],
-        results=SUMMARIES[name](results) if name in SUMMARIES else results,
+        results=beside_others(name, processor, results | {"revision": revision}) if part.by_processor else results,
     )
     RECORDS.mkdir(exist_ok=True)
     (RECORDS / f"{name}.json").write_text(json.dumps(rounded(found), indent=1) + "\n")
+
+
+def beside_others(name: str, processor: str, results: dict) -> dict:
+    """Results by processor: those of this one first, then those that other processors gave before."""
+    before = record(name)
+    others = before["results"] if before else {}
+    return {processor: results} | {other: kept for other, kept in others.items() if other != processor}
 
 
 def rounded(value: object) -> object:

@@ -41,6 +41,7 @@ class Part(NamedTuple):
         data: which folder of `MADE` the command needs.
         needs_gpu: whether it is left out on a machine without a GPU.
         python: another interpreter, where `make` has set one up; without it the part is left out.
+        by_processor: whether the record keeps the latest results of every processor, the newest first.
     """
 
     command: str
@@ -48,6 +49,7 @@ class Part(NamedTuple):
     data: str | None = None
     needs_gpu: bool = False
     python: str | None = None
+    by_processor: bool = False
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -71,7 +73,7 @@ def words(command: str, folder: str) -> list[str]:
 
 
 PARTS = {
-    "frame": Part("bench.speed.frame"),
+    "frame": Part("bench.speed.frame", by_processor=True),
     "training": Part("bench.speed.training --turns 5"),
     "force-balance": Part("bench.speed.speed --only force-balance"),
     "minimum-energy": Part("bench.speed.speed --only minimum-energy"),

@@ -7,46 +7,49 @@ TRACKED = "tracked, from the frame before"
 
 def readme(independent: dict, frame: dict, live: dict) -> Rows:
     head, surface, contact, force, _ = default_accuracy(independent)
-    rows = frame["rows"]
-    times = " / ".join(f"{rows[name]['median']:.0f}" for name in ("one image", "in batches of 16", TRACKED))
+    times = [f"{medians(found['rows'])} ms ({processor})" for processor, found in frame.items()]
     return [
         head,
         ["shape, relative to the displacement", *surface[1:]],
         contact,
         force,
-        ["processor time of one image / in batches / tracked", f"{times} ms", ""],
+        ["processor time of one image / in batches / tracked", "; ".join(times), ""],
         ["latency of a live camera of 30 Hz", f"{live['cases']['default grid']['median']:.0f} ms", ""],
     ]
 
 
-def frame_times(frame: dict, models: dict) -> Rows:
-    rows = frame["rows"]
-    exported = {row["kind"]: row["median"] for row in models["rows"] if row["grid"] == 33}
-    alone, tracking = exported["force balance"], exported["the same, tracking"]
-    return [
-        ["", "processor time"],
-        ["one image", f"{rows['one image']['median']:.0f} ms"],
-        ["in batches of 16, each", f"{rows['in batches of 16']['median']:.0f} ms"],
-        ["tracked: its dots followed from the frame before", f"{rows[TRACKED]['median']:.0f} ms"],
-        ["[exported](export.md), in onnxruntime / also tracked", f"{alone:.0f} / {tracking:.0f} ms"],
-    ]
+def medians(rows: dict) -> str:
+    """Return the times of one image, of a frame in batches and of a tracked one."""
+    return " / ".join(f"{rows[name]['median']:.0f}" for name in ("one image", "in batches of 16", TRACKED))
 
 
-def frame_units(frame: dict) -> Rows:
-    """Time in the unit of work that other machines can do."""
-    rows = frame["rows"]
+def frame_times(frame: dict) -> Rows:
+    """Time of a frame and of its markers on every processor, and in the unit of work that other machines can do."""
     names = {
         "one image": "one image",
         "in batches of 16": "a frame in batches of 16",
-        TRACKED: "a tracked frame",
+        TRACKED: "a tracked frame: its dots are followed from the frame before",
         "markers alone": "the markers alone",
         "markers alone, followed": "the markers alone, followed",
     }
+    each = list(frame.values())
     return [
-        ["", "ms", "times the unit"],
-        ["the unit: 0.45 GFLOP as products of 186 x 186 matrices", f"{rows['unit']['median']:.2g}", "1"],
-        *([text, f"{rows[name]['median']:.2g}", f"{rows[name]['units']:.1f}"] for name, text in names.items()),
+        ["", *(f"{processor} ({found['revision']})" for processor, found in frame.items())],
+        [
+            "the unit: 0.45 GFLOP as products of 186 x 186 matrices",
+            *(f"{found['rows']['unit']['median']:.2g} ms" for found in each),
+        ],
+        *([text, *(in_units(found["rows"][name]) for found in each)] for name, text in names.items()),
     ]
+
+
+def in_units(row: dict) -> str:
+    """Return a time, and in brackets how many units it is.
+
+    >>> in_units(dict(median=21.69, units=4.232))
+    '22 ms (4.2)'
+    """
+    return f"{two_digits(row['median'])} ms ({row['units']:.1f})"
 
 
 def two_digits(value: float) -> str:
@@ -103,8 +106,8 @@ def solve_by_batch(energy: dict, balance: dict) -> Rows:
         *(
             [
                 f"batch {row['batch']}",
-                *(f"{row['milliseconds_a_frame'][name][0]:.2g}" for name in names),
-                f"{solve['batch {batch}, cold'.format(**row)]:.2g}",
+                *(two_digits(row["milliseconds_a_frame"][name][0]) for name in names),
+                two_digits(solve["batch {batch}, cold".format(**row)]),
             ]
             for row in chosen
         ),
@@ -136,7 +139,7 @@ def balance_against_scipy(found: dict) -> Rows:
     return [
         ["", "ms", "of the twin"],
         ["scipy twin", f"{twin:.0f}", "1"],
-        *([name.removesuffix(", cold"), f"{value:.2g}", f"{value / twin:.2f}"] for name, value in each.items()),
+        *([name.removesuffix(", cold"), two_digits(value), f"{value / twin:.2f}"] for name, value in each.items()),
     ]
 
 
@@ -155,7 +158,7 @@ def paper_stages(found: dict) -> Rows:
         "the whole loop": "the whole loop of two rounds",
         "image to result": "image to result",
     }
-    return [["stage", "ms"], *([text, f"{each[name]:.2g}"] for name, text in names.items())]
+    return [["stage", "ms"], *([text, two_digits(each[name])] for name, text in names.items())]
 
 
 LIVE = {
