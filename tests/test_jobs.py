@@ -452,7 +452,7 @@ def test_view_draws_a_frame_of_a_folder_or_a_part(small_sensor, small_images, tm
         assert main(["view", str(path), "--frame", "press9"]) == 2
         assert "no frame 'press9'" in capsys.readouterr().err
     (tmp_path / "bad.parquet").write_bytes(b"PAR1")
-    assert main(["view", str(tmp_path / "bad.parquet")]) == 2 and "not a part" in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "bad.parquet")]) == 2 and "not usable as a part" in capsys.readouterr().err
 
 
 def test_an_interruption_amid_a_result_is_one(tmp_path, monkeypatch):

@@ -186,7 +186,7 @@ def test_wrong_sizes_and_shapes_are_refused_with_both_sizes(reconstructor):
         reconstructor(torch.zeros(1, 1, 384, 512))
     with pytest.raises(MembraneError, match="other than one or three channels"):
         reconstructor(torch.zeros(1, 2, 480, 640))
-    with pytest.raises(MembraneError, match="one for each marker"):
+    with pytest.raises(MembraneError, match="one pixel for each marker"):
         reconstructor.from_pixels(torch.zeros(1, 7, 2))
 
 
