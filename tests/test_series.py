@@ -112,6 +112,19 @@ def test_the_command_draws_a_plot_and_a_sheet(folder, tmp_path, capsys):
         assert "2 results; expected one, or --plot FILE.png alone" in capsys.readouterr().err
 
 
+def test_a_plot_of_folders_with_other_units_names_each_with_its_units(folder, tmp_path, capsys):
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    rows = read_summary(other)
+    with (other / "summary.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows({**row, "length_unit": "m"} for row in rows)
+    assert main(["view", str(folder), str(other), "--plot", str(tmp_path / "forces.png")]) == 2
+    said, (unit, length) = capsys.readouterr().err, (rows[0][f"{of}_unit"] for of in ("force", "length"))
+    assert f"{folder}: {unit} (force), {length} (length); {other}: {unit} (force), m (length); expected the same units" in said
+
+
 def test_a_plot_spares_the_tables_of_all_folders(folder, tmp_path, capsys):
     other = shutil.copytree(folder, tmp_path / "other")
     table = other / "summary.csv"

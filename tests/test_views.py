@@ -22,7 +22,7 @@ from torchmembrane.results.view_status import status_in_words
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.sensor.view_images import first_view_image, first_view_picture
-from torchmembrane.sensor.views import View
+from torchmembrane.sensor.views import View, refuse_views
 from torchmembrane.simulate import Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
 
@@ -230,6 +230,15 @@ def test_the_order_of_the_views_does_not_matter(press, found):
     back = BESIDE.points(got.vertices[0])
     assert float((back - found.vertices[0]).norm(dim=-1).max()) < 0.02 * 1.2
     np.testing.assert_allclose(BESIDE.vectors(got.force[0]).numpy(), found.force[0].numpy(), atol=0.03 * found.force.norm())
+
+
+def test_regions_of_images_of_two_sizes_are_refused_by_the_name_of_the_view():
+    sizes = {"left": (400, 300), "right": (400, 300), "back": (640, 480)}
+    wholes = {name: tm.Camera("pinhole", size, (200, 200), (199.5, 149.5)) for name, size in sizes.items()}
+    views = [View(name, whole.in_mode((0, 0, 160, 120)), is_region=True) for name, whole in wholes.items()]
+    refuse_views(views[:2], has_listed_dots=True)
+    with pytest.raises(MembraneError, match=r"View 'back': image_size .*\[640, 480\].*\[400, 300\], as in view 'left'"):
+        refuse_views(views, has_listed_dots=True)
 
 
 def test_the_first_view_of_a_picture_is_its_region_wherever_that_lies():
