@@ -129,8 +129,8 @@ def forget() -> None:
 
 
 MADE = """
-import json, sys
-machine = dict(processor="A", torch="2.13")
+import json, os, sys
+machine = dict(processor=os.environ["PROCESSOR"], torch="2.13")
 json.dump(dict(machine=machine, rows=[dict(ms=1.2345678, each=[1, 2])]), open(sys.argv[sys.argv.index("--json") + 1], "w"))
 """
 
@@ -141,6 +141,7 @@ def recorded_in(folder: Path, monkeypatch: pytest.MonkeyPatch, part: Part) -> No
         monkeypatch.setattr(measure, name, value)
     monkeypatch.setattr(pages, "RECORDS", folder / "records")
     monkeypatch.setattr(measure, "PARTS", {"made": part})
+    monkeypatch.setenv("PROCESSOR", "A")
     (folder / "made.py").write_text(MADE)
     (folder / "out").mkdir()
 
@@ -165,7 +166,7 @@ def test_the_latest_results_of_other_processors_are_kept(commit, tmp_path, monke
     recorded_in(tmp_path, monkeypatch, Part("made", (), by_processor=True))
     revisions = {}
     for processor in "ABA":
-        (tmp_path / "made.py").write_text(MADE.replace('processor="A"', f"processor={processor!r}"))
+        monkeypatch.setenv("PROCESSOR", processor)
         revisions[processor] = commit("made.py", f"# {len(revisions)}")
         measure.measure("made", None)
     found = pages.record("made")
