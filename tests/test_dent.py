@@ -27,8 +27,9 @@ def estimator() -> ForceBalance:
     )
 
 
-def dented(estimator: ForceBalance, middles: list[int], push: float = 1.0) -> torch.Tensor:
-    """How far every vertex of the dome is moved, `[V, 3]`, when what is within a seventh of its size of some is pushed."""
+def dented(estimator: ForceBalance, middles: list[int], push: float = 1.0, u: torch.Tensor | float = 0.0) -> torch.Tensor:
+    """How far every vertex of the dome, displaced by `u`, is moved, `[V, 3]`, when what is within a seventh of its size of some
+    is pushed."""
     rest = estimator.membrane.rest
     near = (torch.cdist(rest, rest[middles]) < DOME.size / 7).any(1)
     traction = -push * estimator.reference * near.double()[:, None] * DOME.rest_normals
@@ -37,7 +38,8 @@ def dented(estimator: ForceBalance, middles: list[int], push: float = 1.0) -> to
     held = estimator.gauss_newton.traction
     estimator.gauss_newton.traction = lambda state, measured: traction[None]
     try:
-        return estimator.dent(*estimator.at_rest(measured.weight), measured).u[0]
+        state = estimator.at_rest(measured.weight)
+        return (estimator.dent(state.u + u, *state[1:], measured).u - u)[0]
     finally:
         estimator.gauss_newton.traction = held
 
@@ -59,6 +61,15 @@ def test_the_middle_of_a_contact_is_dented_inwards_along_the_normals(estimator, 
     if len(middles) == 1:  # half way between two is a middle as well
         assert depth[distance[:, 0] > 3 * DENT * DOME.size + 2 * step].max() < 0.1 * DENT * DOME.size
     assert (depth[DOME.fixed] == 0).all()
+
+
+def test_a_surface_that_is_already_pressed_in_is_dented_along_the_normals_at_rest(estimator):
+    """Its own normals cross each other where it is deep: a dent along them would fold it."""
+    top = vertex_near(0, 0)
+    deep = torch.exp(-(DOME.rest - DOME.rest[top]).square().sum(-1) / (2 * (0.1 * DOME.size) ** 2))
+    move = dented(estimator, [top], u=-0.3 * DOME.size * deep[:, None] * DOME.rest_normals)
+    assert move.norm(dim=-1).max() > 0.5 * DENT * DOME.size
+    torch.testing.assert_close(torch.linalg.cross(move, DOME.rest_normals), torch.zeros_like(move), rtol=0, atol=1e-9)
 
 
 def test_a_dent_is_a_bell_whose_standard_deviation_is_its_width(estimator):

@@ -217,6 +217,15 @@ def test_each_grid_begins_with_its_scale_and_number_of_steps(dented, monkeypatch
     assert (fine.dent, fine.coarse.coarse.dent) == (None, None) and fine.coarse.dent is not None
 
 
+def test_a_coarser_grid_has_settled_with_steps_as_much_longer_as_its_error_is_larger():
+    """Half the lines, four times the error; both the tensor operations and the machine code read these settings."""
+    one, tol = estimator(spherical_cap(12, 9, 3, (33, 33))), SETTINGS.settled_step_tol
+    for factor in (1, 4, 16):
+        assert one.gauss_newton.settings.settled_step_tol == one.equations.loss.settings.settled_step_tol == factor * tol
+        one = one.coarse
+    assert one is None
+
+
 def test_on_coarser_grids_errors_that_look_like_friction_are_not_forgiven_and_no_markers_lost_to_them():
     """On nine lines that seventeen follow: a quarter of the friction, twice the markers' scale; not on nine alone."""
     fine = estimator(spherical_cap(12, 9, 3, (33, 33)))

@@ -135,8 +135,9 @@ class ForceBalance(Estimator):
     def _coarser(self, elasticity: ElasticEnergy, bearings: MarkerResiduals, friction: float, **others: Any) -> Self | None:
         """Return the estimator on every second line, or None if these are too few.
 
-        Where its discretisation error is larger, the scale of the markers' loss grows as the step of the grid, so that no
-        markers are lost to the error, and the friction falls as its square, because the error looks like friction.
+        Its discretisation error is four times as large, and so is the step with which a frame has settled. Where this error
+        exceeds the markers' noise, the scale of the markers' loss grows as the step of the grid, so that no markers are lost to
+        the error, and the friction falls as its square, because the error looks like friction.
         """
         membrane, grid, positions = self.membrane, self.membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * COARSEST_LINES - 1 for count in grid):
@@ -145,7 +146,8 @@ class ForceBalance(Estimator):
         markers, material = every_second.closest_points(positions.numpy()), elasticity.for_membrane(every_second)
         growth = _coarseness(every_second) / self.coarseness
         given = every_second, material, markers, positions, bearings.noise
-        settings = replace(self.settings, outlier=self.settings.outlier * growth**0.5)
+        outlier, tol = self.settings.outlier * growth**0.5, 4 * self.settings.settled_step_tol
+        settings = replace(self.settings, outlier=outlier, settled_step_tol=tol)
         return type(self)(*given, settings=settings, friction=friction / growth, **others)
 
     @property

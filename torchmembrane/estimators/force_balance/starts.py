@@ -45,8 +45,9 @@ class InitialGuess(nn.Module):
     def forward(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
         """Return the state with a dent in the middle of every contact.
 
-        The middle is the centroid of the neighbourhood with the squared pushes as weights. Pushes that noise alone explains
-        cause almost no dent.
+        The middle is the centroid of the neighbourhood, each vertex weighted by its squared push. Pushes that noise alone
+        explains cause almost no dent. Pushes and dents are along the normals at rest: along those of a surface that is already
+        deeply pressed, a dent could fold it.
 
         Args:
             u: displacement of the vertices, `[B, V, 3]`, in the unit of length of the sensor.
@@ -55,8 +56,8 @@ class InitialGuess(nn.Module):
             measured: rays of the markers in the image.
         """
         membrane, loss = self.membrane, self.gauss_newton.equations.loss
-        normals = membrane.normals(membrane.rest + u)
-        q_n = (self.gauss_newton.traction(State(u, pressure, moved), measured) * normals).sum(-1, keepdim=True)
+        traction = self.gauss_newton.traction(State(u, pressure, moved), measured)
+        q_n = (traction * membrane.rest_normals).sum(-1, keepdim=True)
         compression2 = loss.compression2(inner(q_n, membrane.grid)[..., 0])
         weight = (pad_border(compression2[..., None], membrane.grid)[..., 0] + TINY) * self.area
         middle = (weight[..., None] * membrane.rest).mT @ self.around / (weight @ self.around)[:, None]
@@ -64,4 +65,4 @@ class InitialGuess(nn.Module):
         noise2 = (measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
         share = (compression2.amax(-1) / (compression2.amax(-1) + noise2))[:, None]
         inwards = DENT * membrane.size * share * torch.exp(-off2 / (2 * DENT**2)) * self.free
-        return State(u - inwards[..., None] * normals, pressure, moved)
+        return State(u - inwards[..., None] * membrane.rest_normals, pressure, moved)
