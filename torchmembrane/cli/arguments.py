@@ -54,13 +54,13 @@ def add_estimator(add: Add) -> None:
     add(
         "--flow",
         choices=FLOWS,
-        help="interpolation of the flow between the markers, for the estimator paper (default: bilinear)",
+        help="interpolation of the markers' displacements in the image, of the estimator paper only (default: bilinear)",
     )
     add(
         "--smoothing",
         metavar="S",
         type=positive,
-        help="weight of the smoother (eq. 28), for the estimator paper (default: 0.1)",
+        help="weight of the smoother (eq. 28 of the paper), of the estimator paper only (default: 0.1)",
     )
     how = "how markers are found: by least-squares fit or by soft-argmax (default: soft for paper, else fit)"
     add("--locator", choices=LOCATORS, help=how)

@@ -27,15 +27,16 @@ examples:
   torchmembrane check sensor.toml --robot robot      # as URDF and MJCF, with its contact law
   torchmembrane check preset:bubble --accuracy --out bubble.png
 
-The rest surface is tested in three ways: which forces tension and pressure leave unbalanced, how far the surface is from the
-nearest sheet that is inflated in the same rim and which pressure that sheet has, and whether the model's pressure agrees with a
-gauge (--overpressure). The command reports how a difference affects forces.
+The command tests whether the rest surface is in equilibrium. It reports the force that tension and pressure leave unbalanced.
+It fits a sheet inflated in the same rim, and reports its distance from the surface and its pressure. With --overpressure, it
+compares the model's pressure with the gauge's. Of each difference it says how much it affects forces.
 
 --accuracy presses the sensor in the simulator and reconstructs some 150 images. It reports the noise at rest, the lightest
 touch that is found, the errors of force, depth and contact point, the smallest distance at which two contacts are resolved,
-and how deep a press may be. It takes some minutes of processor time, more for larger images. An interrupted command keeps the
-finished series of presses in a file accuracy-*.unfinished.json beside --out, or else in the current folder. The same command
-continues from there and removes the file at the end. SENSOR.toml may be preset:NAME.
+and how deep a press may be. It takes some minutes of processor time, more for larger images. The tested range of depth and
+force is kept in SENSOR_range.toml beside the sensor file (not of a preset); later results beyond it get status 9. An
+interrupted command keeps the finished series of presses in a file accuracy-*.unfinished.json beside --out, or else in the
+current folder. The same command continues from there and removes the file at the end. SENSOR.toml may be preset:NAME.
 
 exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
@@ -63,7 +64,7 @@ def add_parser(commands: Any) -> None:
     add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also make a spec sheet of the sensor from simulated presses")
     add("--seed", type=seed, help="seed of presses and noise of --accuracy (default: 0)")
-    noise = "image noise for --accuracy: ratio of white to its standard deviation (default: as in the rest image, else 40)"
+    noise = "image noise for --accuracy: white over the noise's standard deviation, dB (default: as in the rest image, else 40)"
     add("--noise", metavar="DB", type=number_from(0, MOST_DECIBEL), help=noise)
     add("--jobs", metavar="J", type=count, help="number of processes of --accuracy (default: one per core)")
 

@@ -26,11 +26,11 @@ examples:
   torchmembrane init sensor.toml            # asks for the numbers, on a terminal
 
 The command needs the shape and its lengths, the size of the image (--image-size or --rest), the focal length (--focal or
---view) and the distance of the rim from the camera (--distance). --rim, the rim's circle in the image, can replace
---distance; or --rim together with --distance can replace the focal length. On a terminal, the command asks for missing
-numbers. The camera looks along the membrane's axis. In the file's frame, the origin is the camera's centre of projection, and
-+z points to the membrane. The dots are given as a list (--dots), found in the rest image (--rest), or made as a pattern
-(--pitch).
+--view) and the distance of the rim from the camera (--distance). For a dome, cap or bubble with --rest, the rim's circle in
+the image (--rim) replaces either the distance or the focal length. On a terminal, the command asks for missing numbers. The
+camera looks along the membrane's axis. In the file's frame, the origin is the camera's centre of projection, and +z points
+to the membrane. The dots are given as a list (--dots) or found in the rest image (--rest). Without both, the file gets a
+pattern of dots with the spacing --pitch.
 
 The list of dots is a CSV file with one of the headers
   x,y,z          in the camera's frame        x,y,h           h is the height above the rim's plane
@@ -109,8 +109,8 @@ def _add_membrane(add: Add) -> None:
         "--shape",
         metavar=f"{{{','.join(DRAFTS)}}}",
         type=_shape,
-        help="half a sphere, a cap of a sphere, a cap filled with gas, half an ellipsoid, half a cylinder, or a sheet "
-        "inflated in a rim",
+        help="dome: half a sphere; cap: of a sphere; bubble: a cap filled with gas; fingertip: half an ellipsoid; "
+        "half_cylinder; rectangle, ellipse: a sheet inflated in such a rim",
     )
     add(
         "--outline",
@@ -169,8 +169,8 @@ def _add_material(add: Add) -> None:
         help="filling of the cavity (default: gas for a bubble or an inflated sheet, else liquid)",
     )
     prestretch = (
-        "prestretch of the membrane at rest (default: from the overpressure, else 1.2), or of the flat sheet in its "
-        "rim (else 1.1)"
+        "stretch of the membrane at rest (default: from the overpressure, else 1.2); of a rectangle, ellipse or --outline, "
+        "that of the flat sheet before it is inflated (default: from the overpressure, else 1.1)"
     )
     add(
         "--overpressure",
@@ -184,7 +184,8 @@ def _add_material(add: Add) -> None:
         "--thickness",
         metavar="T",
         type=positive,
-        help="thickness of the membrane at rest, or of the flat sheet in its rim: unstretched thickness / prestretch^2",
+        help="thickness of the membrane at rest (of a rectangle, ellipse or --outline, before the sheet is inflated): "
+        "unstretched thickness / prestretch^2",
     )
 
 
@@ -195,7 +196,7 @@ def _add_markers(add: Add) -> None:
         "--pitch",
         metavar="LENGTH",
         type=positive,
-        help="spacing of a pattern of dots on the membrane, without --rest and --dots",
+        help="spacing of the pattern of dots, without --rest and --dots (default: a pattern of about 11 x 11)",
     )
     add(
         "--polarity",

@@ -55,7 +55,8 @@ Softening of the membrane can be detected only with a known load. Type `200g` an
 else, stands on the middle of the membrane, or `12hPa` and Enter while a gauge reads this change of the pressure since
 rest. The result is compared with the load. After some comparisons, a warning says if a calibration is due.
 
-exit code: 0 ended or stopped, 2 wrong usage, or the source gives no (more) images"""
+exit code: 0 the recording has ended, or the command was stopped; 2 wrong usage, the source cannot be opened, or the camera
+gives no more images"""
 MODULUS = (
     "softening of the membrane can be detected only with a known load: type a weight or a gauge's reading, as 200g or 12hPa"
 )

@@ -40,10 +40,10 @@ examples:
   torchmembrane reconstruct sensor.toml day1/ --out results --shard 2/8    # on the second of eight machines
 
 DIR then holds
-  NAME.npz       the result for the image NAME.png (parquet: the dataset frames/part-*.parquet)
+  NAME.npz       the result of the image NAME (parquet: the dataset frames/part-*.parquet)
+  NAME.png       a figure of this result (--figures)
   mesh.npz       rest surface, triangles, units
   summary.csv    one row per frame; summary_columns.csv explains its columns
-  NAME.png       its figure (--figures)
 Frames of a video, of a bag, or of an image file with several pictures (TIFF, MPO, animated PNG, WebP or GIF) are
 named STEM_000000, STEM_000001 ... After an interruption, run the same command again: it skips finished frames, and
 repeats frames that failed, whose result is damaged, or whose image has changed. In Python,
@@ -98,8 +98,8 @@ def _add_measured(add: Add) -> None:
     )
     add("--topic", metavar="[VIEW=]TOPIC", action="append", default=[], help=of_bags)
     messages = (
-        "also write a bag (a folder) with the results of the bags: wrenches, tractions, and for a gas pressures, in "
-        "N, N m, m and Pa"
+        "of ROS 2 bags: also write the results as messages to a new bag (a folder), in SI units: wrench, its deviation, "
+        "tractions, contacts, status, and of a gas the pressure"
     )
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = (
@@ -119,7 +119,7 @@ def _add_stored(add: Add) -> None:
     one = "npz: one .npz per frame; parquet: one dataset (default: npz; with --engine ray parquet)"
     add("--format", choices=RESULT_FORMATS, help=one)
     principal = "also store the principal stretches or tensions (force / length) at the vertices, [V, 2] each (npz only)"
-    add("--fields", nargs="+", choices=FIELDS, default=[], help=principal)
+    add("--fields", metavar="FIELD", nargs="+", choices=FIELDS, default=[], help=principal)
     film = (
         "also draw a film of all frames in DIR, in name order: .mp4, .mov, .mkv (extra video) or .gif; as view DIR "
         "--video-out does"

@@ -49,6 +49,10 @@ examples:
 SENSOR.toml may be preset:NAME, one of {", ".join(PRESETS)}. Lengths are in the sensor's unit, in the camera's frame: +z
 points from the camera to the membrane.
 
+A single press needs --indenter and --depth; a sphere or cylinder also needs --radius, a box --sides and --radius, a wedge
+--opening and --radius. A path with slide needs --slide. With --random, sizes and motions are drawn at random, and options that
+set them are refused.
+
 DIR then holds
   sensor.toml       the simulated sensor and its rest image in the same light: torchmembrane reconstruct DIR/sensor.toml ...
   NAME.png          the image (with --path NAME_000000.png ..., with --video NAME.mp4)
@@ -87,7 +91,7 @@ def _add_press(add: Add) -> None:
     add("--sides", metavar="X,Y,Z", type=vector, help="sides of a box; it presses along Z")
     add("--opening", metavar="DEGREES", type=positive, help="opening angle of a wedge")
     add("--depth", metavar="D", type=positive, help="how far the indenter moves from its first touch")
-    direction = "the side from which it comes, seen from the point of --aim (default: %(default)s, straight towards the camera)"
+    direction = "vector from --aim to where the indenter starts (default: %(default)s: it moves towards the camera)"
     add("--direction", metavar="X,Y,Z", type=vector, default="0,0,1", help=direction)
     add("--aim", metavar="X,Y,Z", type=vector, help="the point to which it moves (default: the middle of the rim)")
     add(
@@ -131,7 +135,7 @@ def _add_appearance(add: Add) -> None:
         "--noise",
         metavar="DB",
         type=number_from(0, MOST_DECIBEL),
-        help="noise: ratio of white to its standard deviation (default: no noise)",
+        help="image noise: white over the noise's standard deviation, dB (default: no noise)",
     )
     highlight = "ratio of specular to diffuse light (default: %(default)s)"
     add("--highlight", metavar="SHARE", type=number_from(0, 1), default=HIGHLIGHT, help=highlight)
@@ -150,7 +154,8 @@ def _add_appearance(add: Add) -> None:
         "--grid",
         metavar="M,N",
         type=grid,
-        help="grid on which the equilibrium is solved (default: 38 per side, or finer than the sensor's grid)",
+        help="numbers of vertices of the grid on which the equilibrium is solved; it must be finer than the sensor's grid "
+        "(default: about 38 per side, more if the sensor's grid is fine)",
     )
 
 

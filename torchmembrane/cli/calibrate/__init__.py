@@ -29,12 +29,15 @@ LAID_OUT = """\
   report.png     a figure of the layout"""
 ORDER = """\
 A sensor is calibrated in this order, each step starting from the sensor file of the one before:
-  camera     finds the lens, from a checkerboard in air, before the ports are mounted
-  ports      finds distance, thickness and index of flat layers, from a board of dots, in air and in the medium
+  camera     finds the lens, from a checkerboard in air, before windows are mounted
+  ports      if the camera looks through flat windows (ports): finds their distance, thickness and refractive index, from a
+             board of dots, in air and in the medium
+then exactly one of
   rest       finds the pose of the rest surface, its dots, and the poses of further views, from the rest image, if the
              dots are listed
   views      finds rest surface and dots from several views, if the dots are not listed
   depth      finds rest surface and dots from a depth image, if the dots are not listed
+and at last
   material   finds the prestretch from images of presses, and the stiffness if forces or pressures of some are known
 One further step goes in the opposite direction; it is used before the membrane is made:
   layout     computes positions on the rest surface, for fabrication, from the dots wanted in the image"""
@@ -54,7 +57,7 @@ def add_parser(commands: Any) -> None:
         example = f"example:\n  torchmembrane calibrate {name} {step.example}\n{CONTENT}"
         example += LAID_OUT if name == "layout" else CALIBRATED
         add = add_command(steps, name, partial(_run, step.module, name), step.purpose, example, *step.aliases)
-        add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the preceding step")
+        add("sensor", metavar="SENSOR.toml", help="sensor file of the design, as from init, or of the preceding step")
         step.add_options(add)
         add(
             "--out",
