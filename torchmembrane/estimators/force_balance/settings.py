@@ -35,8 +35,8 @@ class ForceBalanceSettings:
     Args:
         steps: largest number of steps on the coarsest grid, the next one, and any finer one; fewer where a frame settles.
         tau: first and last scale of the loss of compressive traction on the coarsest grid; finer ones have the last alone.
-        settled_step_tol: largest `schedule.scaled_step` at the last scale with which a solution has settled; four times as
-            large on every coarser grid.
+        settled_step_tol: largest `schedule.scaled_step` at the last scale with which a solution has settled; on each coarser
+            grid four times that of the next finer one.
         camera_motion: scale of the prior of the camera's motion relative to the rim at the last tau, px: smaller motions are
             ignored, larger ones are barely penalised further.
         sparsity: twice the loss of the uniform compressive traction p0 on the whole surface, while the loss is quadratic.
