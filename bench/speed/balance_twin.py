@@ -12,7 +12,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.marker_residuals import MeasuredRays
 from torchmembrane.estimators.force_balance.robust import Cauchy
-from torchmembrane.estimators.force_balance.schedule import LEAST_MOVE, falling, outlier_scale, scaled_step
+from torchmembrane.estimators.force_balance.schedule import LEAST_MOVE, falling, outlier_scale, scaled_step, share_of_next
 from torchmembrane.solve.stencil import inner, pad_border
 from torchmembrane.surface.topology import corners, triangles_of
 
@@ -49,17 +49,19 @@ class BalanceTwin:
             still = torch.zeros(1, 4).double()
             u, pressure, _ = e.refined(torch.from_numpy(displacement)[None], torch.tensor([pressure]).double(), still)
         tau, last = e.settings.tau[0 if self.coarse is None else 1], e.settings.tau[1]
+        settings, share = e.gauss_newton.settings, 1.0
         for _ in range(e.steps):
             before = u
-            u, pressure = self.step(u, pressure, measured, tau, outlier_scale(e.gauss_newton.settings.outlier, tau / last))
+            u, pressure = self.step(u, pressure, measured, tau, outlier_scale(settings.outlier, tau / last), share)
             lengths = ((field.square().sum(-1).mean().sqrt() / e.size) for field in (u - before, u))
             moved = scaled_step(*map(float, lengths))
-            if tau <= last and moved <= e.settings.settled_step_tol:
+            if tau <= last and moved <= settings.settled_step_tol:
                 break
+            share = 1.0 if tau > last else min(1.0, share_of_next(moved, settings.settled_step_tol))
             tau = max(last, tau * falling(max(moved, LEAST_MOVE)))
         return u[0].numpy(), float(pressure)
 
-    def step(self, u: torch.Tensor, pressure, measured: MeasuredRays, tau: float, outlier: float):
+    def step(self, u: torch.Tensor, pressure, measured: MeasuredRays, tau: float, outlier: float, share: float):
         e, free, count = self.estimator, self.free, self.count
         x = e.membrane.rest + u
         forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss
@@ -91,9 +93,10 @@ class BalanceTwin:
         move = np.zeros(count)
         move[free] = -Mg - rise * Mm - multiplier * Mn
         move = move.reshape(-1, 3)
-        share = 1.0
+        stretch = 0.0
         surface, change = (a.reshape(*e.membrane.grid, 3) for a in (x[0].numpy(), move))
         for axis in (0, 1):
             edge, turn = (np.linalg.norm(np.diff(a, axis=axis), axis=-1) for a in (surface, change))
-            share = min(share, e.settings.largest_stretch / (turn / edge).max().clip(1e-12))
+            stretch = max(stretch, (turn / edge).max())
+        share *= min(1.0, e.settings.largest_stretch / max(stretch, 1e-12))
         return u + share * torch.from_numpy(move), pressure + share * rise

@@ -18,7 +18,7 @@ from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
-from .schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step, settling_of
+from .schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step, settling_of, share_of_next
 from .settings import ForceBalanceSettings
 
 VERTICES = 9000
@@ -59,8 +59,9 @@ class GaussNewton(nn.Module):
     def forward(self, state: State, measured: MeasuredRays, tau: float, steps: int) -> tuple[State, Tensor]:
         """Return the state in which each frame has settled, and the displacement before the last step.
 
-        A frame has settled when the `scaled_step` at the last `tau` is at most `settled_step_tol`. Frames that have not settled
-        when `SETTLING_STEPS` steps are left take a part of each of these, `RELAXATION`.
+        A frame has settled when the `scaled_step` at the last `tau` is at most `settled_step_tol`. Shortly before, it takes
+        only a part of each step, `share_of_next`. Frames that have not settled when `SETTLING_STEPS` steps are left take at
+        most the share `RELAXATION` of each of these.
 
         Args:
             state: initial state.
@@ -129,7 +130,7 @@ class GaussNewton(nn.Module):
     def _begun(self, u: Tensor, pressure: Tensor, moved: Tensor, tau: float, left: float) -> tuple[Tensor, ...]:
         """Return the arguments of `_next` that it changes, before its first step."""
         done = torch.zeros_like(pressure, dtype=torch.bool)
-        return done, u, pressure, moved, u, torch.full_like(pressure, tau), torch.full_like(pressure, left)
+        return done, u, pressure, moved, u, *(torch.full_like(pressure, value) for value in (tau, 1.0, left))
 
     @traced
     def _next(
@@ -140,10 +141,12 @@ class GaussNewton(nn.Module):
         moved: Tensor,
         before: Tensor,
         tau: Tensor,
+        share: Tensor,
         left: Tensor,
         *of_markers: Any,
     ) -> tuple[Tensor, ...]:
-        """Take a step in every frame; return whether it has settled, the state, the displacement before, and the next `tau`.
+        """Take a step in every frame; return whether it has settled, the state, the displacement before, and the next `tau`,
+        `share` and `left`.
 
         Args:
             done: whether a frame has settled, `[B]`.
@@ -152,16 +155,18 @@ class GaussNewton(nn.Module):
             moved: current camera motion, `[B, 4 W]`.
             before: displacement before the last step, `[B, V, 3]`.
             tau: scale of the loss of compressive traction, `[B]`.
-            left: number of whole steps that are left, `[B]`, the last of what is returned. After these, steps are relaxed and
-                have the last `tau`.
+            share: share of the step that is taken, `[B]`.
+            left: number of steps that are not relaxed and are left, `[B]`. After these, steps have the last `tau`.
             of_markers: the measured rays.
         """
         last, is_whole = self.settings.tau[1], left > 0
-        tau, share = torch.where(is_whole, tau, last), torch.where(is_whole, 1.0, RELAXATION).to(tau)
+        tau, share = torch.where(is_whole, tau, last), torch.where(is_whole, share, share.clamp_max(RELAXATION))
         state = self._compiled_step(State(u, pressure, moved), MeasuredRays(*of_markers), tau, share)
         step = self._scaled_step(u, state.u)
-        settled = ~((tau > last) | (step > self.settings.settled_step_tol))
-        return settled, *state, u, (tau * falling(step.clamp_min(LEAST_MOVE))).clamp_min(last), left - 1
+        tol, is_last = self.settings.settled_step_tol, ~(tau > last)
+        share = torch.where(is_last, share_of_next(step, tol).clamp(0, 1), 1.0)
+        tau, settled = (tau * falling(step.clamp_min(LEAST_MOVE))).clamp_min(last), is_last & ~(step > tol)
+        return settled, *state, u, tau, share, left - 1
 
     def _scaled_step(self, u: Tensor, after: Tensor) -> Tensor:
         """Return the `scaled_step` between the displacements `u` and `after`, `[B, V, 3]` each, `[B]`."""

@@ -26,6 +26,8 @@ LIGHT = 4e-4
 """The same, below which the steps are compared with this displacement: markers' noise displaces a surface by about as much."""
 LEAST_MOVE = 1e-9
 """Relative displacement below which a surface stands still; keeps quotients finite."""
+TINY = 1e-30
+"""Keeps quotients by a tolerance of zero finite."""
 SETTLING_STEPS = 8
 """Number of relaxed steps for frames that have not settled before; at most half of all steps."""
 RELAXATION = 0.5
@@ -60,6 +62,21 @@ def falling(moved: Scalar) -> Scalar:
     """
     ratio: Scalar = RATE ** (1 + STILL / moved)
     return ratio
+
+
+def share_of_next(moved: Scalar, tol: float) -> Scalar:
+    """Return the share of the next step that a frame takes after a step with the `scaled_step` `moved`, `[...]`.
+
+    A frame has settled after a step no longer than `tol`. After a step of at least twice this length, it takes the whole next
+    step, and after a shorter one less of it: the answer does not jump where rounding decides whether the frame has settled. The
+    caller limits the share to the range from 0 to 1.
+
+    Example:
+        >>> round(share_of_next(1.5e-4, 1e-4), 9)
+        0.5
+    """
+    share: Scalar = (moved - tol) / (tol + TINY)
+    return share
 
 
 def outlier_scale(last: Scalar, ratio: Scalar) -> Scalar:

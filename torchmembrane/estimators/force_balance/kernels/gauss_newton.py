@@ -13,12 +13,13 @@ from ....solve.native_band import COLUMNS, ROWS, backward, factor_rows, subtract
 from ....solve.symmetric_2x2 import symmetric_solution
 from ....vectors import BYTES
 from ..camera_motion import camera_stiffness
-from ..schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step
+from ..schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step, share_of_next
 from .equations import CAMERA, FLUID, FORCES, VOLUME, WANTED, load_forces, scale_rows, sum_blocks, weigh, write_vertices
 from .markers import load_markers
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
 ratio_of_tau, scale_of_outliers, scaled = compiled(falling), compiled(outlier_scale), compiled(scaled_step)
+next_share = compiled(share_of_next)
 PART = 64
 """Number of rows whose products are summed in single precision; their sums are added in double precision."""
 
@@ -27,16 +28,17 @@ PART = 64
 def settle(c, work, u, pressure, moved, before, seen, noise_level, gauge, tau, steps, settling):
     """Take at most `steps` steps in place, the last `settling` of them relaxed, as `GaussNewton._next` does; `before [m, n, 3]`
     becomes the displacement before the last."""
-    k, done = c.numbers, False
+    k, done, share = c.numbers, False, 1.0
     before[:] = u
     for j in range(steps):
         if not done:
             before[:] = u
             is_whole = j < steps - settling
             tau = tau if is_whole else k.last_tau
-            step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, 1.0 if is_whole else RELAXATION)
+            step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, share if is_whole else min(share, RELAXATION))
             moved_by = _scaled_step(c, u, before)
             done = not (tau > k.last_tau or moved_by > k.settled_step_tol)
+            share = 1.0 if tau > k.last_tau else min(1.0, next_share(moved_by, k.settled_step_tol))
             tau = max(k.last_tau, tau * ratio_of_tau(max(moved_by, LEAST_MOVE)))
 
 
