@@ -83,9 +83,9 @@ def test_the_scale_falls_slowly_while_the_surface_moves_and_fast_where_it_stands
 
 
 def test_less_and_less_of_a_step_is_taken_as_the_one_before_approaches_the_length_that_settles():
-    """All of it after one of four times this length, nothing after one of this length."""
+    """All of it after one of twice this length, nothing after one of this length."""
     tol = SETTINGS.settled_step_tol
-    moved = tol * torch.tensor([4.0, 2.5, 1.0]).double()
+    moved = tol * torch.tensor([2.0, 1.5, 1.0]).double()
     torch.testing.assert_close(share_of_next(moved, tol), torch.tensor([1.0, 0.5, 0.0]).double())
     assert [share_of_next(value, tol) for value in moved.tolist()] == pytest.approx([1.0, 0.5, 0.0])
 
@@ -143,7 +143,7 @@ def test_each_frame_lowers_its_scale_by_how_far_it_has_moved_and_stops_when_it_h
         for frame, scale, part, by in zip(range(2) if len(scales) == 2 else [1], scales, shares, moved, strict=True):
             assert (scale, part) == pytest.approx((tau[frame], share[frame]))
             tau[frame] = max(SETTINGS.tau[1], scale * falling(max(by, 1e-9)))
-            share[frame] = 1.0 if scale > SETTINGS.tau[1] else min(1.0, (by / SETTINGS.settled_step_tol - 1) / 3)
+            share[frame] = 1.0 if scale > SETTINGS.tau[1] else min(1.0, by / SETTINGS.settled_step_tol - 1)
     assert min(taken[-1][1]) < 1
     last = both[-1][2][0], taken[-1][2][0]
     assert max(last) <= SETTINGS.settled_step_tol < taken[-2][2][0]
@@ -195,7 +195,7 @@ def test_the_answer_does_not_jump_where_rounding_decides_whether_a_frame_has_set
         return state.u[1], before[1], scaled_step(moved, far)
 
     first = solved(1e3)[2]
-    second, at_first, length = solved(first / 4)
+    second, at_first, length = solved(first / 2)
     torch.testing.assert_close(at_first, solved(1e3)[0])
     above, below = solved(length * (1 + 1e-6)), solved(length * (1 - 1e-6))
     torch.testing.assert_close(above[0], second)

@@ -67,15 +67,15 @@ def falling(moved: Scalar) -> Scalar:
 def share_of_next(moved: Scalar, tol: float) -> Scalar:
     """Return the share of the next step that a frame takes after a step with the `scaled_step` `moved`, `[...]`.
 
-    A frame has settled after a step no longer than `tol`. After a step of at least four times this length, it takes the whole
-    next step, and after a shorter one less of it: the answer does not jump where rounding decides whether the frame has
-    settled. The caller limits the share to the range from 0 to 1.
+    A frame has settled after a step no longer than `tol`. After a step of at least twice this length, it takes the whole next
+    step, and after a shorter one less of it: the answer does not jump where rounding decides whether the frame has settled. The
+    caller limits the share to the range from 0 to 1.
 
     Example:
-        >>> round(share_of_next(1e-4, 4e-5), 9)
+        >>> round(share_of_next(1.5e-4, 1e-4), 9)
         0.5
     """
-    share: Scalar = (moved - tol) / (3 * tol + TINY)
+    share: Scalar = (moved - tol) / (tol + TINY)
     return share
 
 
