@@ -70,7 +70,7 @@ class ForceBalanceSettings:
 
     steps: tuple[int, int, int] = (64, 32, 8)
     tau: tuple[float, float] = (4.0, 0.4)
-    settled_step_tol: float = 4e-5
+    settled_step_tol: float = 7e-5
     camera_motion: float = 0.005
     sparsity: float = 9000.0
     scale_share: float = 0.2
