@@ -373,6 +373,7 @@ def test_frames_are_the_same_in_any_batch_within_the_stated_bound(small_sensor, 
         assert (alone.vertices[0] - together.vertices[k]).abs().max() < 1e-3
         assert (alone.force[0] - together.force[k]).norm() < 1e-3 * together.force[k].norm().clamp_min(0.1)
         assert (alone.residual[0] - together.residual[k]).abs() < 1e-3
+        assert torch.equal(alone.confidence[0], together.confidence[k])
 
 
 def test_progress_says_rate_failed_and_unconverged(images, tmp_path, capfd):
