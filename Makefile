@@ -179,10 +179,10 @@ test-arm: out/web/model.onnx
 $(PAGE): out/web/model.onnx $(IMAGES) $(PACKAGES) $(WEB)/build.js $(wildcard $(WEB)/src/*)
 	node $(WEB)/build.js out/web/model.onnx $(IMAGES)
 
-out/web/model.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/*/*.py)
+out/web/model.onnx: out/web/sensor.toml $(shell find torchmembrane -name "*.py")
 	$(BIN)/torchmembrane export $< --out $@ --force
 
-out/web/tracking.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/*/*.py)
+out/web/tracking.onnx: out/web/sensor.toml $(shell find torchmembrane -name "*.py")
 	$(BIN)/torchmembrane export $< --tracking --out $@ --force
 
 out/web/sensor.toml: $(SENSOR) | $(READY)
