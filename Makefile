@@ -21,6 +21,7 @@ SEED ?= $(shell date +%s)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+SOURCES := $(shell find torchmembrane -name "*.py")
 LOWEST := .venv-lowest
 LEROBOT := .venv-lerobot
 PLUGIN := integrations/lerobot_camera_torchmembrane
@@ -179,10 +180,10 @@ test-arm: out/web/model.onnx
 $(PAGE): out/web/model.onnx $(IMAGES) $(PACKAGES) $(WEB)/build.js $(wildcard $(WEB)/src/*)
 	node $(WEB)/build.js out/web/model.onnx $(IMAGES)
 
-out/web/model.onnx: out/web/sensor.toml $(shell find torchmembrane -name "*.py")
+out/web/model.onnx: out/web/sensor.toml $(SOURCES)
 	$(BIN)/torchmembrane export $< --out $@ --force
 
-out/web/tracking.onnx: out/web/sensor.toml $(shell find torchmembrane -name "*.py")
+out/web/tracking.onnx: out/web/sensor.toml $(SOURCES)
 	$(BIN)/torchmembrane export $< --tracking --out $@ --force
 
 out/web/sensor.toml: $(SENSOR) | $(READY)

@@ -156,7 +156,7 @@ class GaussNewton(nn.Module):
             before: displacement before the last step, `[B, V, 3]`.
             tau: scale of the loss of compressive traction, `[B]`.
             share: share of the step that is taken, `[B]`.
-            left: number of steps that are not relaxed and are left, `[B]`. After these, steps have the last `tau`.
+            left: number of steps left before the relaxed ones, `[B]`. Relaxed steps have the last `tau`.
             of_markers: the measured rays.
         """
         last, is_whole = self.settings.tau[1], left > 0

@@ -71,6 +71,10 @@ def share_of_next(moved: Scalar, tol: float) -> Scalar:
     step, and after a shorter one less of it: the answer does not jump where rounding decides whether the frame has settled. The
     caller limits the share to the range from 0 to 1.
 
+    Args:
+        moved: the `scaled_step`, relative to the size, `[...]`.
+        tol: the `scaled_step` with which a frame has settled, relative to the size.
+
     Example:
         >>> round(share_of_next(1.5e-4, 1e-4), 9)
         0.5

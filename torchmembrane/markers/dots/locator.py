@@ -26,8 +26,8 @@ from .seams import Seams
 DIGITS = 8.0  # added to a value in 0..1, it leaves float32 with 20 binary digits after the point
 BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
 """Steps to which the blobs' centres (px), shares of one, the noise (grey) and the confidence are rounded. The start of the fit
-is not known more finely, and after rounding it is the same in every runtime. The confidence is rounded for every sensor, so
-that a frame has the same weights in any batch."""
+is not known more finely, and after rounding it is the same in every runtime. The confidence is rounded for every
+sensor: its last bits depend on the place of the frame in its batch, and would change the frame's result."""
 LARGEST_STRAIN = 0.5  # largest strain of the outlines from which the fit starts
 SPARE = 1.3  # number of blobs searched per dot
 
