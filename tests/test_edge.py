@@ -320,7 +320,10 @@ REFUSED = {
     "huge.png": (declared(saved(GREY, "PNG"), 20000, 20000), "the image is 20000 x 20000 px, expected 8 x 6"),
     "float_255.tif": (saved(GREY.astype(np.float32), "TIFF"), "float values from 0.0 to 235.0; expected finite, in 0..1"),
     "nan.tif": (saved(np.full((6, 8), np.nan, np.float32), "TIFF"), "float values from nan to nan"),
-    "large_32.tif": (saved(WIDE.astype(np.int32) * 2, "TIFF"), "32-bit values from 0 to 120790; 8 or 16 bits are read"),
+    "large_32.tif": (
+        saved(WIDE.astype(np.int32) * 2, "TIFF"),
+        "values from 0 to 120790; expected whole numbers from 0 to 65535: save the image with 8 or 16 bits",
+    ),
     "signed_16.tif": (tiff(WIDE // 2, kind=2), "its values are signed integers"),
     "list.jpg": (sequence("MPO").replace(b"MPF\0", b"MPF\0??", 1), "not readable as an image ("),
     "planes_16.tif": (tiff([WIDE] * 3, photometric=2, planes=3), "colour or alpha with more than 8 bits"),

@@ -194,7 +194,7 @@ def test_a_large_image_is_refused_by_its_header(tmp_path):
     path = tmp_path / "large.png"
     Image.new("1", (13000, 13000)).save(path)
     tracemalloc.start()
-    for size, words in ((None, "13000 x 13000 px; at most 33554432 px are read"), ((640, 480), "13000 x 13000 px")):
+    for size, words in ((None, "13000 x 13000 px; expected at most 33554432 px in all"), ((640, 480), "13000 x 13000 px")):
         with pytest.raises(MembraneError, match=words):
             read_image(path, size)
     with pytest.raises(MembraneError, match="the image is 640 x 480 px, expected 64 x 48: use images of this sensor's camera"):
@@ -289,8 +289,11 @@ def test_a_tiff_is_read_as_its_tags_say(content, expected):
 @pytest.mark.parametrize(
     "values, said",
     [
-        (np.full((4, 4), 70000, np.int32), "32-bit values from 70000 to 70000; 8 or 16 bits are read, or float in 0..1"),
-        (np.full((4, 4), -1, np.int32), "32-bit values from -1 to -1"),
+        (
+            np.full((4, 4), 70000, np.int32),
+            "values from 70000 to 70000; expected whole numbers from 0 to 65535, or float in 0..1",
+        ),
+        (np.full((4, 4), -1, np.int32), "values from -1 to -1"),
         (np.full((4, 4), 255, np.float32), "float values from 255.0 to 255.0; expected finite, in 0..1: divide by white"),
         (np.full((4, 4), np.nan, np.float32), "float values from nan"),
     ],

@@ -197,7 +197,7 @@ def test_a_rim_that_is_no_circle_is_refused(tmp_path, capsys):
     image, _ = photographed(tmp_path, focal=(220.0, 180.0))
     call = ["init", str(tmp_path / "made.toml"), *"--shape dome --radius 12 --lens fisheye --view 150 --rim auto".split()]
     assert main([*call, "--rest", str(image)]) == 2
-    assert "is an ellipse of 172" in capsys.readouterr().err
+    assert "is an ellipse with semi-axes of 172" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("outside", [0.02, 0.9])
@@ -420,4 +420,4 @@ def test_a_pattern_is_laid_out_for_a_design_without_dots_as_for_one_with_dots(tm
         assert main(call) == 0
     listed, unlisted = ((tmp_path / name / "sensor_dots.csv").read_text() for name in ("sensor", "bare"))
     assert listed == unlisted and len(listed.splitlines()) > 50
-    assert main(["check", str(bare)]) == 2 and "file and rest_image are missing" in capsys.readouterr().err
+    assert main(["check", str(bare)]) == 2 and "neither dots nor a rest image is given" in capsys.readouterr().err

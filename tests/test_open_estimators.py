@@ -315,7 +315,9 @@ def test_a_name_is_one_class_s():
     for name in ("still", "paper"):
         with pytest.raises(tm.MembraneError, match=f"'{name}' is {registry.ESTIMATORS[name].__qualname__}'s; expected another"):
             tm.register_estimator(name, Other)
-    with pytest.raises(tm.MembraneError, match="expected letters, digits, hyphens and underscores"):
+    with pytest.raises(
+        tm.MembraneError, match="expected letters, digits, hyphens and underscores, without a digit at the beginning"
+    ):
         tm.register_estimator("linear_map:LinearMap", Other)
 
 

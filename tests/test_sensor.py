@@ -378,7 +378,7 @@ BAD_TEXTS = [
     (replaced('"rest.png"', '"dots.csv"'), '[markers] rest_image = "dots.csv"', "not readable as an image"),
     (replaced("[32, 24]", "[64, 48]"), "rest_image is 32 x 24 px and image_size [64, 48]; expected the same"),
     (replaced('rest_image = "rest.png"\n', "", TEXTURE), "[markers]", "rest_image is missing; expected for texture"),
-    (replaced('rest_image = "rest.png"\n', "", NO_FILE), "[markers]", "file and rest_image are missing"),
+    (replaced('rest_image = "rest.png"\n', "", NO_FILE), "[markers]", "neither dots nor a rest image is given"),
     (replaced('kind = "dots"', 'kind = "texture"'), '[markers] file = "dots.csv"; expected none for texture'),
 ]
 

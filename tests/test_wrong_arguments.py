@@ -170,7 +170,7 @@ def test_a_pressure_may_be_any_number(parts, pressure):
         (lambda made, image: made(image[:, :-1]), "the image is 159 x 120 px, expected 160 x 120"),
         (lambda made, image: made(image[None, None].repeat(4, 1)), "without alpha"),
         (lambda made, image: made(image).frame(1), "Reconstruction.frame: index is 1; expected the number of one of 1 frames"),
-        (lambda made, image: made(image).to("gpu"), "Reconstruction.to: 'gpu'; expected a device that there is"),
+        (lambda made, image: made(image).to("gpu"), "Reconstruction.to: 'gpu'; expected an existing device, such as 'cpu',"),
         (lambda made, image: tm.Reconstructor("sensor.toml"), "Reconstructor: sensor is 'sensor.toml'; expected a Sensor"),
         (lambda made, image: tm.Tracker("sensor.toml"), "Tracker: reconstructor is a str; expected a tm.Reconstructor"),
     ],

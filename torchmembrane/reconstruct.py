@@ -331,8 +331,17 @@ class Reconstructor(nn.Module):
         return {name: principal_fields(elasticity, self.estimator.membrane, result.vertices, name) for name in names}
 
     def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
-        """Return the standard deviations of vertices, total force and pressure of `result` that the locator's noise causes, and
-        the gauge's noise if its `pressure` was given; NaN where no surface was found.
+        """Return the standard deviations of the vertices, the total force and the pressure of `result`.
+
+        They are caused by the locator's noise and, if `pressure` was given, by the gauge's noise.
+
+        Args:
+            result: a result of this reconstructor.
+            pressure: readings of a gauge with which it was computed, as in `forward`; None if there were none.
+
+        Returns:
+            Deviations of vertices `[B, V, 3]`, force `[B, 3]` and pressure `[B]`, in the units of `result`; NaN where there is
+            no surface.
 
         Raises:
             MembraneError: the estimator does not compute standard deviations.

@@ -84,7 +84,8 @@ def compared(number: int, folder: Path, sensor: Sensor) -> dict[str, Any]:
     row |= dict(
         apart=found.distance, displacement=displacement, rounding=rounding(reconstructor, grey), statuses=found.expected
     )
-    row["same"] = found.status == found.expected and found.distance <= CLOSE * max(displacement, 1.0)
+    row["statuses_equal"] = found.status == found.expected
+    row["same"] = row["statuses_equal"] and found.distance <= CLOSE * max(displacement, 1.0)
     return row
 
 

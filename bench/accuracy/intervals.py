@@ -66,7 +66,7 @@ def line(name: str, rows: list[dict], of: str) -> dict[str, float]:
         f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {ranks:.2f} ({normal:.2f})"
         + (f", too shallow by {np.median(-signed / size):.2f}" if of == "depth" else "")
     )
-    return dict(held=float(held), width=float(wide), ranks=ranks)
+    return dict(held=float(held), width=float(wide), ranks=ranks, shallow=float(np.median(-signed / size)))
 
 
 def report(rows: list[dict]) -> list[dict]:

@@ -1,17 +1,19 @@
 """The rim found in rendered photographs: how far centre and half axes are off, px.
 
-python -m bench.accuracy.rim
+python -m bench.accuracy.rim [--json FILE]
 
 Two domes, two caps and a bubble, the lens' centre up to 15 px off the image's (seed 0), each in six lights: darker and lighter
 outside, noise of 30 to 40 dB, blur up to 2 px, highlights, vignetting, light from one side.
 """
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 import torch
 
 import torchmembrane as tm
+from bench.data.record import write
 from torchmembrane.calibrate.rim import find_rim
 from torchmembrane.camera.model import Camera
 from torchmembrane.markers.dots.pattern import find_dots
@@ -37,9 +39,11 @@ LIGHTS = [
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
     torch.set_num_threads(1)
-    rng, largest = np.random.default_rng(0), 0.0
+    rng, largest, rows = np.random.default_rng(0), 0.0, []
     for shape, lengths, distance, lens, view in SENSORS:
         surface, focal = drafted_surface(shape, lengths, distance), focal_of_view(lens, 640, view)
         u, v = 319.5 + rng.uniform(-15, 15), 239.5 + rng.uniform(-15, 15)
@@ -53,12 +57,15 @@ def main() -> None:
             try:
                 rim = find_rim(image, find_dots(image, "dark").pixels)
             except tm.MembraneError as error:
+                rows.append(dict(shape=shape, light=light, refused=str(error)))
                 print(f"{shape} {radius:.1f} px, {light}: refused: {error}", flush=True)
                 continue
             off = np.array([rim.centre[0] - u, rim.centre[1] - v, *(axis - radius for axis in rim.half_axes)])
-            largest = max(largest, float(abs(off).max()))
+            rows.append(dict(shape=shape, light=light, off=float(abs(off).max())))
+            largest = max(largest, rows[-1]["off"])
             print(f"{shape} {radius:.1f} px, {light}: off by {off.round(2).tolist()}, said {rim.deviation:.2f}", flush=True)
     print(f"largest error: {largest:.2f} px")
+    write(args.json, dict(rows=rows))
 
 
 if __name__ == "__main__":

@@ -3,9 +3,10 @@
 python -m bench.accuracy.sequence FOLDER... [--json FILE]
 
 A FOLDER holds sensor.toml and either frames 000.png, 001.png ... with truth.npz (`dots_nominal [D, 3]`, `dots_deformed [F, D,
-3]`), or light_000.npz, light_001.npz ... as of data/random_sensors.py --light. Every frame is reconstructed from rest, and from
-the one before. Printed: rms distance of both surfaces over the rms displacement, over the sequence and in the worst frame; each
-one's error at the dots over their displacement; frames with a status; processor time a frame.
+3]`), or light_000.npz, light_001.npz ... as of data/random_sensors.py --light, or folders of that kind, s0000, s0001 ...
+Every frame is reconstructed from rest, and from the one before. Printed: rms distance of both surfaces over the rms
+displacement, over the sequence and in the worst frame; each one's error at the dots over their displacement; frames with a
+status; processor time a frame.
 """
 
 import argparse
@@ -75,7 +76,8 @@ def main():
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     with torch.no_grad():
-        write(args.json, dict(rows=[compared(folder) for folder in args.folders]))
+        folders = [each for folder in args.folders for each in sorted(folder.glob("s[0-9]*/")) or [folder]]
+        write(args.json, dict(rows=[compared(folder) for folder in folders]))
 
 
 if __name__ == "__main__":

@@ -199,7 +199,7 @@ def polygon_centroid(p: np.ndarray) -> np.ndarray:
 
 
 def ink_centroid(ink: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """Of the ink in the outline's bounding box and a pixel around it."""
+    """Return the centroid `u, v` of the ink in the bounding box of `outline [A, 2]`, enlarged by a pixel on each side, px."""
     (u0, v0), (u1, v1) = np.floor(outline.min(0)).astype(int) - 1, np.ceil(outline.max(0)).astype(int) + 2
     v, u = np.mgrid[v0:v1, u0:u1]
     w = ink[v0:v1, u0:u1]

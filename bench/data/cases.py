@@ -2,12 +2,13 @@
 
 python -m bench.data.cases OUT [--seed 0] [--grid 48]
 
-Six sensors of 137 to 187 dots, a dome far from the camera (pinhole, fisheye, through Plexiglas and water) and near (fisheye),
-a fingertip and a half cylinder, of three materials (neo-Hookean with prestretch 1.3 and 1.05, Mooney-Rivlin); spheres, plates
-and cylinders, two at once, 1.5 to 4 mm deep with friction 0 to 0.8, one ball that slides. Of each press NAME_clean.png,
-NAME_snr30.png (30 dB) and NAME_truth.npz, as of `torchmembrane simulate`; index.json lists all. Places and directions come
-from the seed, the equilibrium from the project's simulator on a finer grid than the estimator's. What is there is kept;
-seconds are printed.
+The six sensors have 137 to 187 dots: a dome far from the camera, seen by a pinhole lens, by a fisheye lens, and through
+Plexiglas and water; a dome near a fisheye lens; a fingertip; and a half cylinder. There are three materials: neo-Hookean with
+prestretches of 1.3 and 1.05, and Mooney-Rivlin. They are pressed by spheres, plates and cylinders, in some presses by two
+bodies at once, 1.5 to 4 mm deep with friction 0 to 0.8; one ball slides. For each press, NAME_clean.png, NAME_snr30.png (30 dB
+of noise) and NAME_truth.npz are written, in the form of `torchmembrane simulate`; index.json lists them. The seed determines
+places and directions. The project's simulator solves the equilibrium on a finer grid than the estimator's. Existing files are
+kept, and the time of each press is printed in seconds.
 """
 
 import argparse

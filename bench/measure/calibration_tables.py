@@ -9,7 +9,7 @@ from bench.measure.accuracy_tables import Rows
 STEPS = {
     "lens, pinhole": "`camera`: pinhole, 640 x 480, 12 images",
     "lens, fisheye": "`camera`: fisheye, 12 images",
-    "ports, pinhole, air": "`ports`: pinhole, six images in air; truth 4 mm, 3 mm, 1.49, 1.33",
+    "ports, pinhole, air": "`ports`: pinhole, images in air (truth: distance 4 mm, thickness 3 mm, index 1.49, medium 1.33)",
     "ports, pinhole, medium": "`ports`: six images in the medium",
     "ports, pinhole, both": "`ports`: both together",
     "rest, fingertip": "`rest`: `fingertip`, 1 degree and 0.3 mm off",
@@ -103,8 +103,9 @@ def pose_effect_alone(found: dict) -> str:
     of = {row["sensor"]: row["not nulled"] for row in found["effect"] if row["estimator"] == "force-balance"}
     design, calibrated = ([f"{100 * of[name][k]:.0f}" for name in ("fingertip", "half_cylinder")] for k in (0, 1))
     return (
-        f"Without nulling (`from_pixels` alone) the displacement is wrong by {design[0]} % (`fingertip`) and {design[1]} % "
-        f"(`half_cylinder`) with the design and force balance, and by {calibrated[0]} and {calibrated[1]} % after calibration."
+        f"If the offsets of the dots at rest are not subtracted (`from_pixels` without `rest_pixels`), the displacement is "
+        f"wrong by {design[0]} % (`fingertip`) and {design[1]} % (`half_cylinder`) "
+        f"with the design and force balance, and by {calibrated[0]} and {calibrated[1]} % after calibration."
     )
 
 

@@ -23,6 +23,7 @@ MADE = {
     "gauge": (f"{RANDOM_SENSORS} --sensors 14 --presses 2 --light 8",),
     "intervals": tuple(f"{RANDOM_SENSORS}/{seed} --sensors 40 --presses 2 --light 6 --seed {seed}" for seed in SEEDS),
     "range": (f"{RANDOM_SENSORS} --sensors 160 --presses 4 --seed 8126",),
+    "sequence": (f"{RANDOM_SENSORS} --sensors 10 --presses 0 --light 20 --seed 41995",),
     "degraded-images": (f"{RANDOM_SENSORS} --sensors 15",),
     "precision": (),
     "live-exported": (),
@@ -79,6 +80,11 @@ PARTS = {
     "minimum-energy": Part("bench.speed.speed --only minimum-energy"),
     "paper-chain": Part("bench.speed.speed --only paper --image examples/two_contacts.png"),
     "exported-models": Part("bench.speed.exported_models", EXPORT),
+    "loading": Part("bench.speed.loading", EXPORT),
+    "rim": Part(
+        "bench.accuracy.rim",
+        ("torchmembrane/calibrate", "torchmembrane/markers", "torchmembrane/presets", "torchmembrane/simulate"),
+    ),
     "scaling": Part("bench.speed.scaling"),
     "simulator": Part("bench.accuracy.simulator", SIMULATOR),
     "one-dimension": Part("bench.accuracy.one_dimension", ("torchmembrane/estimators/paper/studies",)),
@@ -105,6 +111,7 @@ PARTS = {
         f"crash-{name}": Part(f"bench.robustness.crash_recovery --latest 2.5 --workers 1 {options}", JOBS)
         for name, options in (("npz", "--format npz"), ("parquet", "--format parquet"), ("ray", "--engine ray"))
     },
+    "throughput": Part("bench.speed.throughput examples/sensor.toml examples/press_on_axis.png --ray", JOBS),
     "fuzz": Part("bench.robustness.fuzz", FILES),
     "walks": Part("bench.speed.walks", (*PRESSED, *CLI)),
     "live": Part("bench.speed.live", (*FRAME, "torchmembrane/live")),
@@ -116,6 +123,9 @@ PARTS = {
     "ros": Part("bench.speed.ros", (*FRAME, "ros/torchmembrane_ros"), python=".venv-ros/bin/python"),
     "gpu": Part("bench.speed.gpu --batches 1 4 16 64 256 1024 2048", needs_gpu=True),
     "independent": Part("bench.accuracy.accuracy CASES", data="independent"),
+    "light-independent": Part(
+        f"bench.accuracy.light {' '.join(f'CASES/light/{name}' for name in ('l01', 'l04', 'l06', 'l07'))}", data="independent"
+    ),
     "simulator-independent": Part("bench.accuracy.simulator CASES", SIMULATOR, data="independent"),
     "cases": Part("bench.accuracy.accuracy CASES", CASES, data="cases"),
     "locators": Part("bench.accuracy.locators CASES", ("torchmembrane/markers", "bench/data/cases.py"), data="cases"),
@@ -134,6 +144,7 @@ PARTS = {
     ),
     "ablation": Part("bench.accuracy.ablation CASES", CASES, data="cases"),
     "gauge": Part("bench.accuracy.gauge DATA", RANDOM, data="gauge"),
+    "rough-gauge": Part("bench.accuracy.gauge DATA --noise 0.01 --told 0.01", RANDOM, data="gauge"),
     "views": Part("bench.accuracy.views --first 1 --sensors 20 --presses 3", (*RANDOM, "torchmembrane/simulate")),
     "calibration-coverage": Part(
         "bench.accuracy.calibration_coverage --seed 3 --sensors 102",
@@ -145,6 +156,9 @@ PARTS = {
     "views-soft": Part("bench.accuracy.views --first 40 --sensors 20 --presses 3 --soft", (*RANDOM, "torchmembrane/simulate")),
     "iterations": Part("bench.accuracy.iterations --seed 11", PRESSED),
     "knocked": Part("bench.accuracy.knocked --first 1 --sensors 10 --presses 3", (*RANDOM, "torchmembrane/simulate")),
+    "at-rest": Part("bench.accuracy.at_rest --sensors 20", (*RANDOM, "torchmembrane/simulate")),
+    "sequence": Part("bench.accuracy.sequence DATA", RANDOM, data="sequence"),
+    "exports": Part("bench.accuracy.exports", (*EXPORT, "torchmembrane/simulate", "bench/data/random_sensors.py")),
     "light": Part("bench.accuracy.range DATA --only light", RANDOM, data="light"),
     "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),
     "range": Part("bench.accuracy.range DATA", RANDOM, data="range"),

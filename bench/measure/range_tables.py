@@ -38,6 +38,17 @@ def pins_summary(results: dict) -> dict:
     return dict(groups=groups)
 
 
+def contacts(found: dict) -> str:
+    """A paragraph on what is told of the contacts of random presses."""
+    rim, of = found["at_rim"], {key: "{:.2g} / {:.2g}".format(*pair) for key, pair in found["errors"].items()}
+    return (
+        f"`contact_at_rim` is set wrongly for {rim['wrong']} of the {rim['contacts']} contacts that are at least 0.1 of the "
+        f"size and a spacing of the dots away from the rim. For contacts away from the rim, the errors (median / 90 %) are "
+        f"{of['moment']} length units for moment over force (the rims' radii are 8 to 60), {of['patch_force']} for the force "
+        f"of the patch, {of['slip']} for the slip ratio, and {of['curvature']} for the curvature of spheres."
+    )
+
+
 def by_depth(found: dict) -> tuple[dict[str, int], dict[str, int]]:
     """Of presses up to a fifth of the size deep, and of deeper ones: %, right with any status, right with ok, wrong with ok."""
     groups = found["groups"]
@@ -98,14 +109,14 @@ def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights:
         ],
         [
             "intervals",
-            f"one `force_deviation` contains the truth in {100 * held['force']['held']:.0f} % of frames, one "
-            f"`depth_deviation` in {100 * held['depth']['held']:.0f} %",
+            f"the true force lies within one `force_deviation` of the result in {100 * held['force']['held']:.0f} % of frames, "
+            f"the true depth within one `depth_deviation` in {100 * held['depth']['held']:.0f} %",
             "[intervals](force_balance.md#intervals)",
         ],
         [
             "degraded images",
-            f"{degraded['ok']} of {degraded['images']} pass with status ok; {degraded['wrong']} of these surfaces, "
-            f"{degraded['mirrored']} of them mirrored or upside down, are off by more than a quarter",
+            f"{degraded['ok']} of {degraded['images']} have status ok; the surfaces of {degraded['wrong']} of these are off by "
+            f"more than a quarter (images that are mirrored or upside down: {degraded['mirrored']})",
             "[range](force_balance.md#range)",
         ],
         ["drift of the rest state", "noticed while nothing touches the membrane", "[drift](drift.md#measured)"],

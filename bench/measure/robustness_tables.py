@@ -172,8 +172,9 @@ def life(found: dict) -> str:
     return (
         f"The change is reported in {soft['said']} of {soft['lives']} lives, after {middle} presses in the median ({least} to "
         f"{most}), when forces are overestimated by {off[1]} % ({off[0]} to {off[2]} %). Of {firm['lives']} membranes that do "
-        f"not soften it is reported for {firm['said']}. The {found['weights']['count']} weights that were measured there are "
-        f"off by {weights[0]} in the median and by {weights[1]} in nine of ten cases."
+        f"not soften, it is reported for {firm['said'] or 'none'}. The error of each weight is drawn from those of "
+        f"{found['weights']['count']} simulated presses, which are off by {weights[0]} in the median and by less than "
+        f"{weights[1]} in nine of ten cases."
     )
 
 

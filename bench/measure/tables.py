@@ -6,6 +6,7 @@ from pathlib import Path
 import bench.measure.accuracy_tables as accuracy
 import bench.measure.calibration_tables as calibration
 import bench.measure.paper_tables as paper
+import bench.measure.paragraphs as paragraphs
 import bench.measure.range_tables as working_range
 import bench.measure.robustness_tables as robustness
 import bench.measure.scaling_tables as scaling
@@ -23,6 +24,8 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = 
     "markers-independent": (("independent",), accuracy.marker_errors),
     "markers-cases": (("cases",), accuracy.marker_errors),
     "exported-models": (("exported-models",), speed.exported_models),
+    "loading": (("loading",), paragraphs.loading),
+    "exports": (("exports",), paragraphs.exports),
     "training": (("training",), speed.training),
     "solve-by-batch": (("minimum-energy", "force-balance"), speed.solve_by_batch),
     "gpu": (("gpu",), speed.gpu),
@@ -42,18 +45,26 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = 
     "agreement": (("simulator-independent",), simulator.agreement),
     "window-mistakes": (("window-mistakes",), simulator.window_mistakes),
     "windows": (("windows",), simulator.windows),
+    "window-intervals": (("windows",), paragraphs.window_intervals),
+    "rim": (("rim",), paragraphs.rim),
     "calibration-coverage": (("calibration-coverage",), calibration.interval_coverage),
     "cli-errors": (("cli-errors",), simulator.cli_errors),
     "memory": (("memory",), simulator.memory),
+    "throughput": (("throughput",), paragraphs.throughput),
     "ablation": (("ablation",), accuracy.ablation),
     "iterations": (("iterations",), accuracy.iterations),
     "light": (("light",), accuracy.light_touches),
+    "light-independent": (("light-independent",), paragraphs.light_independent),
+    "at-rest": (("at-rest",), paragraphs.at_rest),
+    "sequence": (("sequence",), paragraphs.sequence),
     "gauge": (("gauge",), accuracy.gauge),
+    "rough-gauge": (("rough-gauge",), paragraphs.rough_gauge),
     "intervals": (("intervals",), accuracy.intervals),
     "views": (("views",), accuracy.views),
     "views-deep-and-soft": (("views-deep", "views-soft"), accuracy.deep_and_soft_views),
     "knocked": (("knocked",), accuracy.knocked),
     "range": (("range",), accuracy.working_range),
+    "range-contacts": (("range",), working_range.contacts),
     "readme-range": (("range",), working_range.readme_range),
     "limits": (("range", "light", "intervals", "degraded-images", "weight"), working_range.limits),
     "pins": (("pins",), working_range.pins),
@@ -101,6 +112,9 @@ SUMMARIES: dict[str, Callable[[dict], dict]] = {
     "ablation": accuracy.ablation_summary,
     "light": accuracy.light_summary,
     "gauge": accuracy.gauge_summary,
+    "rough-gauge": accuracy.gauge_summary,
+    "light-independent": paragraphs.light_independent_summary,
+    "exports": paragraphs.exports_summary,
     "intervals": accuracy.intervals_summary,
     "views": accuracy.views_summary,
     "views-deep": accuracy.views_summary,

@@ -53,7 +53,7 @@ class EnergyTwin:
         return self.to_vertices @ np.concatenate([-of_b - of_c, of_b, of_c])
 
     def volume_gradient(self, x: np.ndarray) -> np.ndarray:
-        """The volume's derivative, `[V, 3]`."""
+        """Return the derivative of the enclosed volume with respect to the vertices `x [V, 3]`: `[V, 3]`, length^2."""
         a, b, c = (x[self.triangles[:, k]] for k in range(3))
         return self.to_vertices @ np.concatenate([np.cross(b, c), np.cross(c, a), np.cross(a, b)]) / 6
 

@@ -1,18 +1,22 @@
 """Processor time of loading an exported model, and of a frame of it, with onnxruntime's reuse of memory and without.
 
-python -m bench.speed.loading MODEL.onnx [--rounds 60] [--loads 3]
+python -m bench.speed.loading [MODEL.onnx] [--rounds 60] [--loads 3] [--json FILE]
 
-One thread; processor time, as other programs may share the cores. The edge package loads models without the reuse. Times of
-loading are medians over the loads. The frame is noise, and a tracking model gets no previous frame. Both sessions run it in
-turn; the ratio is the median over the runs.
+Without a MODEL.onnx, the example sensor is exported. One thread; processor time, as other programs may share the cores. The
+edge package loads models without the reuse. Times of loading are medians over the loads. The frame is noise, and a tracking
+model gets no previous frame. Both sessions run it in turn; the ratio is the median over the runs.
 """
 
 import argparse
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
+
+import torchmembrane as tm
+from bench.data.record import write
 
 TYPES = {"tensor(float)": np.float32, "tensor(uint8)": np.uint8}
 
@@ -37,24 +41,43 @@ def frame_of(session: onnxruntime.InferenceSession) -> dict[str, np.ndarray]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path)
+    parser.add_argument("model", type=Path, nargs="?")
     parser.add_argument("--rounds", type=int, default=60)
     parser.add_argument("--loads", type=int, default=3)
+    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    loads = [[session_of(args.model, reuse) for reuse in (True, False)] for _ in range(args.loads)]
+    with tempfile.TemporaryDirectory() as folder:
+        model = args.model or Path(folder) / "model.onnx"
+        if not args.model:
+            tm.export(tm.Reconstructor.from_file("examples/sensor.toml"), model)
+        found = measure(model, args.loads, args.rounds)
+    print(f"{args.model or 'the example sensor'}: {found['megabytes']:.1f} MB, onnxruntime {found['onnxruntime']}")
+    print(f"loading: {found['load_reuse']:.1f} s with reuse of memory, {found['load']:.1f} s without")
+    print(f"a frame: {1e3 * found['frame']:.0f} ms with, without {found['ratio']:.2f} times as long")
+    write(args.json, found)
+
+
+def measure(model: Path, times_loaded: int, rounds: int) -> dict:
+    """Return the model's size, and seconds of processor time with reuse and without."""
+    loads = [[session_of(model, reuse) for reuse in (True, False)] for _ in range(times_loaded)]
     sessions, feed, times = [session for session, _ in loads[-1]], frame_of(loads[-1][0][0]), []
-    for _ in range(args.rounds):
-        each = []
+    for _ in range(rounds):
+        both = []
         for session in sessions:
             start = time.process_time()
             session.run(None, feed)
-            each.append(time.process_time() - start)
-        times.append(each)
+            both.append(time.process_time() - start)
+        times.append(both)
     reuse, without = np.median([[seconds for _, seconds in both] for both in loads], 0)
     first, second = np.array(times[1:]).T
-    print(f"{args.model}: {args.model.stat().st_size / 1e6:.1f} MB, onnxruntime {onnxruntime.__version__}")
-    print(f"loading: {reuse:.1f} s with reuse of memory, {without:.1f} s without")
-    print(f"a frame: {1e3 * np.median(first):.0f} ms with, without {np.median(second / first):.2f} times as long")
+    return dict(
+        megabytes=model.stat().st_size / 1e6,
+        onnxruntime=onnxruntime.__version__,
+        load_reuse=float(reuse),
+        load=float(without),
+        frame=float(np.median(first)),
+        ratio=float(np.median(second / first)),
+    )
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ def measured(settings: dict, base: Simulator, pressed: torch.Tensor, turns: int)
 
 
 def least_seconds(function, turns: int) -> float:
-    """Least processor time of several calls after one."""
+    """Return the smallest processor time of `turns` calls, in seconds, after one call that is not counted."""
     times = []
     for _ in range(turns + 1):
         start = time.process_time()

@@ -301,7 +301,9 @@ def _grey_of_more_bits(image: Any, tags: Mapping[int, Any], bits: int | None) ->
         raise EdgeError(f"float values from {low} to {high}; expected finite, in 0..1: divide by white")
     if image.mode == "I":  # also grey of 16 bits, as Pillow before 10.3 opens it
         if low < 0 or high > 65535:
-            raise EdgeError(f"32-bit values from {low} to {high}; 8 or 16 bits are read")
+            raise EdgeError(
+                f"values from {low} to {high}; expected whole numbers from 0 to 65535: save the image with 8 or 16 bits"
+            )
         values = values.astype(np.uint16)
     seen = grey(values[None], bits)
     return 1 - seen if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO else seen

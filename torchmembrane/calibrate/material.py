@@ -1,4 +1,4 @@
-"""The membrane's prestretch from images of presses, and its modulus from known forces or pressures."""
+"""Calibrate the membrane's prestretch from images of presses, and its modulus from known forces or pressures."""
 
 from collections.abc import Sequence
 from dataclasses import replace

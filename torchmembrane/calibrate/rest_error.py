@@ -74,7 +74,14 @@ def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tupl
 
 
 def changed_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
-    """Raise the rest surface of a sensor by a share of its height over the rim; otherwise like `at_other_height`."""
+    """Return a sensor whose rest surface is `1 + share` times as high over its rim, and the mask `[D]` of the markers kept.
+
+    The markers move along their rays. A negative share lowers the surface. Unlike `at_other_height`, this function does not try
+    the other direction.
+
+    Raises:
+        MembraneError: the surface folds.
+    """
     surface = sensor.surface
     if isinstance(surface, InflatedSurface):
         surface = surface.of_height((1 + share) * surface.formed.height)

@@ -29,7 +29,8 @@ def add_parser(commands: Any) -> None:
     size = "the sensor file, or preset:NAME; its image size is requested from the camera (default: the camera's own size)"
     add("sensor", metavar="SENSOR.toml", nargs="?", help=size)
     opened = (
-        "the camera, opened by OpenCV: its number from 0, its path or its address; for several views one each, with its name"
+        "the camera, opened by OpenCV: its number from 0, its path or its address; for a sensor with several views, give the "
+        "option once for each view, as VIEW=CAMERA"
     )
     add("--camera", metavar="[VIEW=]NUMBER|PATH", action="append", required=True, help=opened)
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the photographs; photographs in it are kept")

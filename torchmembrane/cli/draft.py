@@ -126,9 +126,12 @@ def refuse_foreign(arguments: Namespace) -> None:
     for one, other in (("focal", "view"), ("dots", "pitch"), ("rest", "pitch")):
         if getattr(arguments, one) is not None and getattr(arguments, other) is not None:
             raise MembraneError(f"init: --{one} and --{other}; expected only one of them, because they are alternatives")
-    if arguments.rim is not None and (arguments.rest is None or arguments.shape not in CIRCULAR):
+    if arguments.rim is not None and arguments.rest is None:
+        raise MembraneError("init: --rim without --rest; expected also --rest, the image that shows the rim")
+    if arguments.rim is not None and arguments.shape not in CIRCULAR:
         raise MembraneError(
-            f"init: --rim; expected also --rest, the image that shows the rim, and a circular rim ({', '.join(CIRCULAR)})"
+            f"init: --rim with --shape {arguments.shape}; expected a shape with a circular rim ({', '.join(CIRCULAR)}): leave "
+            "out --rim, and give --distance and --focal or --view"
         )
     if arguments.rim is not None and arguments.distance is not None and (arguments.focal or arguments.view):
         lens = "--focal" if arguments.focal else "--view"
@@ -139,7 +142,8 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
     size = arguments.image_size or list(rest.shape[::-1] if rest is not None else ())
     if rest is not None and list(rest.shape[::-1]) != size:
         raise MembraneError(
-            f"init: --image-size {size[0]},{size[1]} and {arguments.rest} of {rest.shape[1]} x {rest.shape[0]} px"
+            f"init: --image-size {size[0]},{size[1]}, but {arguments.rest} has {rest.shape[1]} x {rest.shape[0]} px; expected "
+            "the same size: leave out --image-size, or give a rest image of that size"
         )
     focal = arguments.focal or (arguments.view and focal_of_view(arguments.lens, size[0], arguments.view))
     distance, centre = arguments.distance, arguments.centre or [(side - 1) / 2 for side in size]
@@ -163,9 +167,10 @@ def _rim_in_words(arguments: Namespace, rest: np.ndarray) -> list[str]:
     (u, v), (longer, shorter) = rim.centre, rim.half_axes
     if shorter < ROUND * longer:
         raise MembraneError(
-            f"init: the rim in {arguments.rest} is an ellipse of {longer:.1f} x {shorter:.1f} px about {u:.1f},{v:.1f}; "
-            "expected a circle, as a camera on the membrane's axis sees it: take the photograph along the axis, or pass --rim "
-            "U,V,RADIUS for a first guess and list the dots, --dots, for `calibrate rest`, which finds the tilt"
+            f"init: the rim in {arguments.rest} is an ellipse with semi-axes of {longer:.1f} and {shorter:.1f} px, centred at "
+            f"{u:.1f},{v:.1f}; expected a circle, as a camera on the membrane's axis sees it: take the photograph along the "
+            "axis, or pass --rim U,V,RADIUS for a first guess and list the dots, --dots, for `calibrate rest`, which finds the "
+            "tilt"
         )
     radius = (longer + shorter) / 2
     arguments.rim = [round(number, 2) for number in (u, v, radius)]

@@ -71,10 +71,14 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "live", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     opened = (
-        "the camera, opened by OpenCV: its number from 0, its path or its address; for several views one each, with its name"
+        "the camera, opened by OpenCV: its number from 0, its path or its address; for a sensor with several views, give the "
+        "option once for each view, as VIEW=CAMERA"
     )
     add("--camera", metavar="[VIEW=]NUMBER|PATH", action="append", help=opened)
-    recorded = "a video, played like a camera (extra video); for several views that of the first one, NAME_VIEW"
+    recorded = (
+        "a video, played like a camera (needs the extra video); for a sensor with several views, the first view's video, "
+        "NAME_VIEW.mp4, with the others beside it"
+    )
     add("--video", metavar="FILE", type=Path, help=recorded)
     add("--images", metavar="FOLDER", type=Path, help="a folder of images, played like a camera in the order of their names")
     add(

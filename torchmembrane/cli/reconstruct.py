@@ -76,7 +76,8 @@ def _add_work(add: Add) -> None:
     each = "number of processes, of one thread each; 1: only this process (default: one per core, if there are enough frames)"
     add("--workers", metavar="N", type=count, help=each)
     where = (
-        "compute on this machine (default), or on the Ray cluster of RAY_ADDRESS into a Parquet dataset; see docs/clusters.md"
+        "local: compute in this process and its workers (default); ray: compute with Ray, on the cluster of RAY_ADDRESS or "
+        "else on this machine, and write a Parquet dataset; see docs/clusters.md"
     )
     add("--engine", choices=ENGINES, default=ENGINES[0], help=where)
     part = (
@@ -93,8 +94,8 @@ def _add_measured(add: Add) -> None:
         help="treat every input as a video (mp4, mov, avi, mkv, webm and gif always are); needs the extra video",
     )
     of_bags = (
-        "topic of the images in ROS 2 bags (default: the only one; needs the extra ros); for several views one each, "
-        "with its name"
+        "topic of the images in ROS 2 bags (default: the only one; needs the extra ros); for a sensor with several "
+        "views, give the option once for each view, as VIEW=TOPIC"
     )
     add("--topic", metavar="[VIEW=]TOPIC", action="append", default=[], help=of_bags)
     messages = (

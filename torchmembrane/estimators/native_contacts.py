@@ -24,25 +24,29 @@ Limits = tuple[float, float, float, float, float]
 
 
 class Constants(NamedTuple):
-    """Constants of a membrane."""
+    """Arrays and limits that stay the same for all frames of a membrane; see `contacts.ContactPatches`."""
 
     rest: Any
-    """`[m, n, 3]`"""
+    """Vertices at rest `[m, n, 3]`, length unit."""
     area: Any
-    """`[V]`, at rest."""
+    """Area of each vertex at rest `[V]`."""
     near_rim: Any
-    """`[V]`, as `beside_rim`."""
+    """`[V]`, 1 where a vertex is closer to the rim than `contacts.RIM` or the markers' spacing, else 0."""
     beside_rim: Any
+    """`[V]`, weight of the displacement of the vertices beside the rim, 0 elsewhere."""
     surroundings: Any
     """`[N, N]`, a mean around every inner vertex in each column; where its rows are not zero, `places [N, 2]`."""
     places: Any
     pushed: float
+    """This and the next four: the constants PUSHED, LEAST, APART, RIM_SHARE and MOVED of `contacts`."""
     least: float
     apart: float
     rim_share: float
     moved: float
     least_span: float
+    """Smallest diameter of a patch whose curvatures are reported, length unit."""
     size: float
+    """Size of the surface, length unit."""
 
 
 @compiled

@@ -29,7 +29,7 @@ def register_estimator(name: str, kind: type[Estimator]) -> None:
     An installed package registers its estimators for all processes by entry points of the group `torchmembrane.estimators`.
 
     Args:
-        name: name of the estimator, of letters, digits, hyphens and underscores.
+        name: name of the estimator, of letters, digits, hyphens and underscores; it must not begin with a digit.
         kind: a subclass of `Estimator`.
 
     Raises:
@@ -43,7 +43,10 @@ def register_estimator(name: str, kind: type[Estimator]) -> None:
         torchmembrane.errors.MembraneError: register_estimator: 'paper' is PaperEstimator's; expected another name
     """
     if not name.replace("-", "_").isidentifier():
-        raise MembraneError(f"register_estimator: name = {name!r}; expected letters, digits, hyphens and underscores")
+        raise MembraneError(
+            f"register_estimator: name = {name!r}; expected letters, digits, hyphens and underscores, without a digit at the "
+            "beginning"
+        )
     check_protocol(kind, f"register_estimator: {name!r}")
     if ESTIMATORS.setdefault(name, kind) is not kind:
         raise MembraneError(f"register_estimator: {name!r} is {ESTIMATORS[name].__qualname__}'s; expected another name")

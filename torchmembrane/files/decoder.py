@@ -65,7 +65,10 @@ def opened(path: str | Path, file: IO[bytes]) -> Iterator[Image.Image]:
     try:
         with Image.open(file, formats=FORMATS) as image:
             if image.width * image.height > MOST_PIXELS:
-                raise ValueError(f"{image.width} x {image.height} px; at most {MOST_PIXELS} px are read")
+                raise MembraneError(
+                    f"{image.width} x {image.height} px; expected at most {MOST_PIXELS} px in all: crop the image or "
+                    "reduce its resolution"
+                )
             yield image
     except MembraneError as error:
         raise MembraneError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
@@ -198,7 +201,10 @@ def _values(image: Image.Image) -> np.ndarray:
     if image.mode == "I":  # 16-bit grey as Pillow of some versions opens it
         values = np.asarray(image)
         if values.min() < 0 or values.max() > HIGHEST:
-            raise ValueError(f"32-bit values from {values.min()} to {values.max()}; 8 or 16 bits are read, or float in 0..1")
+            raise MembraneError(
+                f"values from {values.min()} to {values.max()}; expected whole numbers from 0 to 65535, or float in 0..1: save "
+                "the image with 8 or 16 bits"
+            )
         return values.astype(np.uint16)
     if image.mode == "F" or image.mode.startswith("I;16"):
         values = np.asarray(image)

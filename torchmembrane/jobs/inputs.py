@@ -122,11 +122,15 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
         if count > 1:
             twins = ", ".join(printable(str(path)) for path in paths if frame_name(path) == name)
             raise MembraneError(
-                f"two inputs have the name {name!r} ({twins}), and so would their results: rename one, or use two calls"
+                f"several inputs have the name {name!r} ({twins}), so their results would have the same name: rename them, or "
+                "reconstruct them in separate calls with different output folders"
             )
     for image in inputs.images:
         if of_video := inputs.video_of(frame_name(image)):
-            raise MembraneError(f"{image}: a frame of {of_video} has the same name; use two calls")
+            raise MembraneError(
+                f"{image}: a frame of {of_video} has the same name: rename one, or reconstruct them in separate calls with "
+                "different output folders"
+            )
         if f"{image.stem}.npz" == MESH:
             raise MembraneError(f"{image}: its result would be {MESH}, which holds the mesh; rename the image")
     return inputs

@@ -82,10 +82,18 @@ def outcomes_here(work: Work, sources: Iterator[Source], batch: int) -> Iterator
 
 
 def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
-    """Yield the outcomes computed by worker processes, in the order of the sources; videos are decoded in this process.
+    """Yield the outcomes of all frames, one list per batch, in the order of the sources; worker processes compute them.
+
+    Videos are decoded in this process.
+
+    Args:
+        workers: number of processes.
+        work: what each of them does.
+        sources: the frames.
+        batch: number of frames in a batch.
 
     Raises:
-        MembraneError: a worker process has ended.
+        MembraneError: a worker process ended unexpectedly, for example because memory ran out.
     """
     reconstructor = work.reconstructor.reconstructor
     with _pool(workers, work) as pool:

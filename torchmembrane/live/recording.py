@@ -66,7 +66,10 @@ class Recording:
         except OSError as failure:
             said = f"--record {self.folder}: {failure.strerror or failure}"
             if error is None:
-                raise MembraneError(f"{said}; the recording cannot be finished, what was written before is kept") from failure
+                raise MembraneError(
+                    f"{said}; the recording cannot be finished. What was written is kept: free some space, and run "
+                    f"`torchmembrane reconstruct` on {self.folder / IMAGES}"
+                ) from failure
             warn_user(f"{said}; the recording cannot be finished")
 
     def keep(self, seen: LiveFrame) -> None:

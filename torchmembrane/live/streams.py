@@ -93,7 +93,8 @@ class ModelStream:
     """
 
     def __init__(self, path: Path, sensor: str, threads: int = 1):
-        self._edge = edge = load_edge()
+        self._edge, self._path = load_edge(), path
+        edge = self._edge
         try:
             self._session = edge.Session(path, threads)
         except edge.EdgeError as error:
@@ -111,7 +112,7 @@ class ModelStream:
         try:
             self._before = self._session.run(self._batch(image), self._before)
         except self._edge.EdgeError as error:
-            raise MembraneError(f"--model: {error}") from error
+            raise MembraneError(f"--model {self._path}: the model refuses the camera's image: {error}") from error
         return completed({key: values[0] for key, values in self._before.items()})
 
     def _batch(self, image: Captured) -> Any:

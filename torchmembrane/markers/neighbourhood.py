@@ -23,7 +23,7 @@ class NeighbourFlow(NamedTuple):
     support: Tensor  # [B, D], share of the neighbours that agree, 0..1
 
     def trust(self, flow: Tensor) -> Tensor:
-        """Return the confidence `[B, D]` in 0..1 that flow `[B, D, 2]` agrees with the prediction."""
+        """Return the confidence `[B, D]`, 0..1, that a flow `[B, D, 2]`, px, agrees with the prediction."""
         distance = ((flow - self.flow).square().sum(-1) + 1e-12).sqrt()
         return (2.5 - distance / self.scale).clamp(0, 1) * (self.support > 0.25)
 

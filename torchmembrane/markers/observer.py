@@ -261,7 +261,10 @@ class MarkerObserver(nn.Module):
         """Check the markers at rest given by a caller, and return them as `[D, 2]` px."""
         rest = tensor_of("rest_pixels", rest_pixels).to(self.rest_pixels)
         if rest.shape != self.rest_pixels.shape:
-            raise MembraneError(f"rest_pixels {list(rest.shape)}; expected {list(self.rest_pixels.shape)}, one for each marker")
+            raise MembraneError(
+                f"from_pixels: rest_pixels of shape {list(rest.shape)}; expected {list(self.rest_pixels.shape)}, one pixel for "
+                "each marker"
+            )
         return rest
 
     def before(self, previous: Any, frames: int) -> Tensor:

@@ -196,7 +196,9 @@ class Reconstruction(NamedTuple):
             moved = {key: value.to(*args, **kwargs) for key, value in self._asdict().items()}
         except (TypeError, ValueError, RuntimeError, AssertionError, OverflowError) as error:
             said = ", ".join(map(repr, (*args, *kwargs.values())))
-            raise MembraneError(f"Reconstruction.to: {said}; expected a device that there is, or a torch.dtype") from error
+            raise MembraneError(
+                f"Reconstruction.to: {said}; expected an existing device, such as 'cpu', or a torch.dtype"
+            ) from error
         return Reconstruction(**(moved | {"status": moved["status"].to(self.status.dtype)}))
 
     def cpu(self) -> "Reconstruction":

@@ -51,7 +51,10 @@ def with_rest_images(file: Table, views: list[View], markers: Markers) -> tuple[
     if shared is None:
         return views, replace(markers, rest_image=views[0].rest_image)
     if apart := [view.name for view in views if view.region is None]:
-        expected = f"none, as view {apart[0]!r} has no region: give each [[camera]] a region, or a rest_image of its own"
+        expected = (
+            f"no rest_image in [markers], because view {apart[0]!r} has no region of a shared image: give each [[camera]] a "
+            "region, or each a rest_image of its own"
+        )
         raise file.table("markers").refuse("rest_image", expected)
     return [replace(view, rest_image=view.camera.mode.image(shared)) for view in views], markers  # type: ignore[union-attr]
 

@@ -159,7 +159,10 @@ class Markers:
         elif self.kind == "texture":
             raise MembraneError("rest_image is missing; expected for texture, whose patches are chosen in it: add one")
         elif self.positions is None:
-            raise MembraneError("file and rest_image are missing; expected dots, an image that shows them, or both")
+            raise MembraneError(
+                "neither dots nor a rest image is given; expected positions (in a sensor file: file), a rest_image in which "
+                "the dots are found, or both"
+            )
         if self.positions is None:
             expect(self.sizes is None, "sizes", self.sizes, "none without positions")
             self._set_height(0)

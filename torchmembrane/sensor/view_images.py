@@ -111,7 +111,10 @@ def view_files(path: Path, names: Sequence[str]) -> list[Path]:
         return [path]
     first = f"_{names[0]}"
     if not path.stem.endswith(first):
-        raise MembraneError(f"{path}: expected the first view's image, NAME{first}{path.suffix}, beside those of the others")
+        raise MembraneError(
+            f"{path}: the name does not end with {first!r}, the first view's; expected NAME{first}{path.suffix}, with the "
+            "images of the other views beside it"
+        )
     stem = path.stem.removesuffix(first)
     return [path.with_name(f"{stem}_{name}{path.suffix}") for name in names]
 

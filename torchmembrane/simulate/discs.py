@@ -1,4 +1,4 @@
-"""Drawing of discs into an image, in front of its contents: the tips of pins."""
+"""Draw the tips of pins into an image, as discs in front of everything else."""
 
 import torch
 from torch import Tensor

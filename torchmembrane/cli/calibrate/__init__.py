@@ -120,7 +120,8 @@ def _ports_options(add: Add) -> None:
 
 def _rest_options(add: Add) -> None:
     at_rest = (
-        "image of the membrane at rest; for several views that of the first one, NAME_VIEW, or the image whose regions they are"
+        "image of the membrane at rest; for a sensor with several views, the first view's image, NAME_VIEW.png, with the "
+        "others beside it, or the image that contains all views as regions"
     )
     add("image", metavar="REST.png", help=at_rest)
     gauge = "for an inflated surface: reading of a gauge at rest, inside minus outside, with its unit, as 12hPa"
@@ -133,7 +134,7 @@ def _views_options(add: Add) -> None:
         metavar="IMAGES",
         nargs="+",
         help="images of the membrane at rest; the first with the camera in its place in the sensor; for a sensor with several "
-        "views one image of each, NAME_VIEW, or the image whose regions they are",
+        "views, one image of each, NAME_VIEW.png, or the image that contains all views as regions",
     )
     where = (
         "CSV x,y,z,turn_x,turn_y,turn_z: approximate pose of the camera for each image, relative to that of the first image; "
@@ -154,8 +155,8 @@ def _depth_options(add: Add) -> None:
     step = "unit of the depth values, in the sensor's unit (default: 1 mm for 16-bit images, else the sensor's unit)"
     add("--unit", metavar="LENGTH", type=positive, help=step)
     at_rest = (
-        "image of the membrane at rest, in which the dots are found; for several views that of the first one, "
-        "NAME_VIEW, or the shared image"
+        "image of the membrane at rest, in which the dots are found; for a sensor with several views, the first view's image, "
+        "NAME_VIEW.png, or the image that contains all views as regions"
     )
     add("--image", metavar="REST.png", required=True, help=at_rest)
     _view_option(add, "to whose camera the depth image is registered")

@@ -80,14 +80,14 @@ class CameraMotion(NamedTuple):
         return eased
 
     def eliminated(self, products: Tensor) -> tuple[Tensor, Tensor]:
-        """Eliminate the camera from the products of three loads with their solutions.
+        """Eliminate the camera from the products of the loads of volume, forces and pressure with their solutions.
 
         Args:
             products: products `x . M^-1 y` of the loads and the coupling (rows `x`, columns `y`), `[B, 3 + 4 W, 3 + 4 W]`.
 
         Returns:
             The products of the loads with the camera eliminated, `[B, 3, 3]`, and the camera's response to each load,
-            `[B, 4 W, 3]`; the second load includes the gradient in the motion.
+            `[B, 4 W, 3]`; the second load, of the forces and markers, includes the gradient in the motion.
         """
         loads, coupling = products[:, :, :3], products[:, :, 3:]
         pulled = loads[:, 3:] - F.pad(self.slope[..., None], (1, 1))

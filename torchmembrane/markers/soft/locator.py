@@ -152,7 +152,7 @@ class SoftLocator(nn.Module):
 
     @traced
     def of_large(self, values: Tensor) -> Tensor:
-        """Return the values of the large dots from those of all dots, `[B, D, ...]`."""
+        """Return the values of the large dots, `[B, L, ...]`, from those of all dots, `[B, D, ...]`."""
         return values[:, self.large]
 
     def levels(self, dark: Tensor) -> list[Tensor]:

@@ -124,7 +124,7 @@ def _products(y, used):
 
 @compiled
 def substituted(work, shares):
-    """Write to `solved` the solution for a sum of loads, of which `factored` wrote `U^-T b` to `y`, with these shares."""
+    """Solve `M x = sum_l shares[l] b_l` and write x to `solved [3 N]`; `factored` has written `U^-T b_l` to `y`."""
     for i in range(len(work.scale)):
         total = shares[0] * work.y[i * COLUMNS]
         for load in range(1, len(shares)):

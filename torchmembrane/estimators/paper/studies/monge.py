@@ -94,16 +94,17 @@ def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> 
 class MongeMinimumEnergy(nn.Module):
     """Minimum-energy estimator with heights at fixed (x, y) as unknowns, for harmonic material and liquid filling; for studies.
 
-    It minimises `|Q psi - gamma|^2 + s |S psi|^2` at constant volume. Q is the derivative of the pieces' 3 x 2 maps in psi.
-    Their second-order terms, from rays that meet a tilted surface, are neglected. A rest load in psi is subtracted, so that
-    zero flow gives exactly psi = 0.
+    The unknown `psi [F]` is the height of the free vertices above their rest height `s(x, y)`. The estimator minimises
+    `|Q psi - gamma|^2 + w |S psi|^2` at constant volume. Q is the derivative, with respect to psi, of the 3 x 2 maps of the
+    pieces, `-gamma` their value at psi = 0, and S the grid's Laplacian. The second-order terms of the maps, from rays that meet
+    a tilted surface, are neglected. A rest load in psi is subtracted, so that zero flow gives exactly psi = 0.
 
     Args:
         membrane: the rest surface.
         elasticity: elastic energy of the membrane; "harmonic".
         rest_rays: rays of the vertices at rest, `(origins, directions)`, `[V, 3]` each.
         steps: number of steps; 1 is the paper's solution (eqs. 18, 22, about psi = 0), more repeat it about the surface found.
-        smoothing: s relative to the rest tension.
+        smoothing: weight w relative to the rest tension.
 
     Raises:
         MembraneError: the surface is not a graph over (x, y).
