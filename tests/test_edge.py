@@ -851,7 +851,7 @@ def test_results_that_a_frame_cannot_start_from_are_refused(edge, tmp_path):
     with pytest.raises(edge.EdgeError, match="2 images with previous results pixels"):
         session.run(np.stack([GREY, GREY]), first)
     assert [len(found["status"]) for found in session.track([GREY, GREY.tolist() and GREY])] == [1, 1]
-    with pytest.raises(edge.EdgeError, match="NoneType; expected a video's images"):
+    with pytest.raises(edge.EdgeError, match="images are of type NoneType; expected an iterable of a video's images"):
         next(session.track(None))
     model.write_bytes(model_of(metadata()))
     with pytest.raises(edge.EdgeError, match="does not track"):

@@ -243,7 +243,7 @@ def test_entries_of_rows_are_selected_one_by_one_and_whole_rows_as_such(frames):
 
 
 def test_a_number_that_depends_on_the_batch_is_refused():
-    with pytest.raises(ValueError, match="depends on the batch size, as a number"):
+    with pytest.raises(ValueError, match="computes with the batch size as a value, not as a length"):
         traced_model(Lengths(lambda x, batch: x + float(2 * batch)), {"x": torch.rand(2, 3)}, ["y"])
 
 

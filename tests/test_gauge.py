@@ -313,7 +313,10 @@ def test_the_command_takes_readings_of_frames(recording, tmp_path, capsys):
     [
         ("name,hPa\np0,3\n", "header is 'name,hPa'"),
         ("name,pressure\np7,3\n", "'p7' is none of the frames"),
-        ("name,pressure\np0,three\n", "line 2: pressure = 'three'; expected a number with a decimal point"),
+        (
+            "name,pressure\np0,three\n",
+            "line 2: pressure = 'three'; expected a number such as 12 or 1.5, with a point and not a comma",
+        ),
         ("name,pressure\np0,3\np0.png,3\n", "twice"),
         ("name,pressure\np0,3,4\n", "3 values"),
         ("name,pressure\np0,inf\n", "line 2: pressure = inf; expected a finite number"),

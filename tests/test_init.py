@@ -327,7 +327,7 @@ ROWS = "\n".join(f"{x},{y}" for x in (-4, 0, 4) for y in (-4, 0, 4))
         (f"x,y\n{ROWS}\n30,0\n", "line 11: 30,0 misses the membrane"),
         ("a,b\n1,2\n", "the header is 'a,b'; expected x,y,z or x,y,h or x,y or angle,azimuth or u,v, each with ,size"),
         ("x;y\n1;2\n", "the header is 'x;y'"),
-        (f"x,y\n{ROWS}\n1,a\n", "line 11: y = 'a'; expected a number with a decimal point"),
+        (f"x,y\n{ROWS}\n1,a\n", "line 11: y = 'a'; expected a number such as 12 or 1.5, with a point and not a comma"),
         (f"x,y\n{ROWS}\n1,nan\n", "line 11: y = nan; expected a finite number"),
         (f"x,y\n{ROWS}\n1,2,3\n", "line 11: 3 values, 1,2,3; expected two, x,y"),
         ("x,y,size\n" + ROWS.replace("\n", ",large\n") + ",medium\n", "line 10: size = 'medium'; expected small or large"),

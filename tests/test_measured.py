@@ -118,6 +118,13 @@ def test_a_table_is_old_if_statements_have_changed_but_not_if_texts_have(commit,
         commit("a.py", "")
         forget()
         assert bool(pages.changes_since(second, ("a.py",))) == (raises == "TypeError")
+    third = commit("a.py", "def refusal():\n    return ValueError('no')")
+    (tmp_path / "a.py").write_text(
+        (tmp_path / "a.py").read_text().replace("return ValueError('no')", "return ValueError('yes')")
+    )
+    commit("a.py", "")
+    forget()
+    assert not pages.changes_since(third, ("a.py",))
     commit("b.txt", "# other files count as they are")
     assert is_old()
 
@@ -179,7 +186,7 @@ def drifts(part, **of):
     return [dict(part=part, said=9, drift=0.2, contacts=0, early=False, kind="sags") | of]
 
 
-PRESS = dict(kind="press", width=2.0, at_rim=False, surface=0.1, force=0.1)
+PRESS = dict(kind="press", width=2.0, at_rim=False, surface=0.1, force=0.1, spacing=1.0, size=10.0, moment=0.2, slip=0.01)
 ABOUT = dict(filling="gas", prestretch=1.05, dots=90, markers="dots", seen=1.0, clear=0.3)
 THREE = (0, 0.01, 0.1), (0, 0.15, 0.9), (9, 0.25, 0.1)  # status, depth and error: right, wrong with ok, right with a status
 RAW = {
@@ -213,6 +220,19 @@ RAW = {
     "fuzz": dict(videos=dict(cases=100, kinds={"refused": 3, "decoded": 97}, broken=[], slowest=0.1, largest_MB=12)),
     "pins": dict(presses=[dict(height=h, file=f, status=0, surface=0.3, force=0.01) for h in (0, 4) for f in PINS]),
     "range": dict(rows=[PRESS | ABOUT | dict(status=status, depth=depth, surface=off) for status, depth, off in THREE]),
+    "light-independent": dict(
+        bands=[dict(low=low, high=1, frames=4, force=(0.02, 0.3), surface=(0.1, 0.2), found=0.25) for low in (0, 0.02)],
+        rows=[dict(sensor=name, true_force=force, contacts=0) for name in "ab" for force in (0.0, 1.0)],
+    ),
+    "exports": dict(
+        rows=[
+            dict(
+                number=k, same=same, seconds=50 + k, megabytes=3, statuses_equal=True, apart=0.02, displacement=2, rounding=0.03
+            )
+            for k, same in ((0, True), (1, False))
+        ]
+        + [dict(number=2, same=False, error="too large")]
+    ),
     "knocked": dict(
         presses=[
             {
@@ -244,6 +264,13 @@ SAID = {
     "fuzz": ("| videos | 100 | 3 | 97 | 0 | 0.1 s | 12 MB |",),
     "pins": ("0 (painted)", "| 4 mm | tips taken for dots | 0.3 / 0.3 | 0.01 / 0.01 | 1 of 1 | 1 |"),
     "range": ("| all | 3 | 0.333 | 0.333 | 0.333 |", "| 0.2 to 0.3 | 1 | 0.00 | 1.00 | 0.00 |"),
+    "light-independent": (
+        "2 strokes",
+        "are 0.02 / 0.30.",
+        "1 of 4 contacts is found",
+        "2 frames at rest, a contact is reported in none",
+    ),
+    "exports": ("3 exports, 1 is refused", "(numbers 1)", "1 to 1 %", "50 s of processor", "51 s at most", "3 MB"),
     "knocked": ("| 5.0 / 5.0 | 5.0 / 5.0 |", "| 1 of 1 | 0 of 1 |", "| 0.020 / 0.020 |", "| 1, 0 | 1, 0 |", "| 1 | 1 |"),
     "weight": ("3 of 4", "1.05 to 1.05", "5.0 %", "all: 20 forces"),
 }
@@ -264,3 +291,12 @@ def test_the_paragraph_on_the_range_counts_right_presses_with_any_status():
     said = readme_range(SUMMARIES["range"](RAW["range"]))
     assert "50 % are right, 50 % with status `ok`" in said
     assert "0.3 of the size 100 % are right, 0 % with status `ok`" in said and "one in 3 is wrong" in said
+
+
+def test_the_paragraph_on_contacts_counts_those_clear_of_the_rim():
+    """Of presses that end 0.3 of the size off the rim, one of three is said to be at it; errors are of those with status ok."""
+    raw = [row | dict(at_rim=k == 0, curvature=0.1) for k, row in enumerate(RAW["range"]["rows"])]
+    said = TABLES["range-contacts"][1](SUMMARIES["range"](dict(rows=[row | dict(patch_force=0.02) for row in raw])))
+    assert (
+        "wrongly for 1 of the 3 contacts" in said and "0.2 / 0.2 length units" in said and "0.02 / 0.02 for the force" in said
+    )

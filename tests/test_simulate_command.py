@@ -266,7 +266,7 @@ def test_a_folder_of_another_look_or_sensor_is_refused(sensor_path, tmp_path, ca
         (("--random", "3", "--depth", "1"), "--depth"),
         (("--random", "3", "--indenter", "cone"), "cone"),
         (("--indenter", "sphere", "--radius", "3", "--depth", "30"), "press"),
-        ((*SPHERE, "--direction=0,0,-1"), "--direction 0,0,-1: it would push the membrane from within"),
+        ((*SPHERE, "--direction=0,0,-1"), "--direction 0,0,-1: the indenter would push the membrane from within"),
         ((*SPHERE, "--slide", "1e300,0,0"), "--slide 1e+300,0,0: not possible for this membrane; expected lengths from"),
         (("--indenter", "sphere", "--radius", "1e300", "--depth", "1"), "--radius 1e+300: not possible"),
         (("--indenter", "sphere", "--radius", "3", "--depth", "1e300"), "--depth 1e+300: not possible"),

@@ -165,7 +165,7 @@ def test_a_pressure_may_be_any_number(parts, pressure):
             "Reconstructor.read: paths is .'a.png', 'b.png'.; expected text or a path",
         ),
         (lambda made, image: made(torch.tensor(1.0)), r"images \[\]; expected \[H, W\].*give an image's array"),
-        (lambda made, image: made(image, rest_pixels=torch.zeros(7, 2)), r"rest_pixels \[7, 2\]; expected \[49, 2\]"),
+        (lambda made, image: made(image, rest_pixels=torch.zeros(7, 2)), r"rest_pixels of shape \[7, 2\]; expected \[49, 2\]"),
         (lambda made, image: made(image, previous=image), "previous has no pixels, it is a ndarray"),
         (lambda made, image: made(image[:, :-1]), "the image is 159 x 120 px, expected 160 x 120"),
         (lambda made, image: made(image[None, None].repeat(4, 1)), "without alpha"),

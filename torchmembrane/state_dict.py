@@ -18,7 +18,7 @@ SAME_MARKERS = 1e-4  # largest distance between the rest markers of two states o
 
 
 def drop_derived_buffers(module: nn.Module) -> None:
-    """Omit the constants that are rebuilt from the sensor from a module's state; parameters that were added are kept.
+    """Leave those constants out of a module's `state_dict` that can be rebuilt from the sensor; added parameters are kept.
 
     A state that holds all constants can still be loaded: their shapes are checked, and the constants are ignored. A state with
     another prestretch or camera, which may have been learned, is loaded with a warning.

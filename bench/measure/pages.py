@@ -100,7 +100,7 @@ def changes_since(revision: str, paths: tuple[str, ...]) -> list[str]:
 @cache
 def program(name: str, revision: str) -> str:
     """What a figure can depend on in a file: the statements of Python, without docstrings, comments, layout and the messages of
-    errors that are raised."""
+    errors."""
     text = git("show", f"{revision}:./{name}")
     if not name.endswith(".py"):
         return text
@@ -108,6 +108,8 @@ def program(name: str, revision: str) -> str:
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             node.exc.args = []
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("Error"):
+            node.args = []
         if isinstance(body := getattr(node, "body", None), list):
             node.body = [each for each in body if not is_text(each)]
     return ast.dump(tree)

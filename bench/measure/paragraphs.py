@@ -13,10 +13,11 @@ def light_independent(found: dict) -> str:
     bands = [row for row in found["bands"] if row["low"]]
     errors = ", ".join("{:.2f} / {:.2f}".format(*row["force"]) for row in bands)
     light, rest = next(row for row in found["bands"] if not row["low"]), found["rest"]
+    seen = round(light["found"] * light["frames"])
     return (
         f"For {found['strokes']} strokes of an independent program, the errors of the force in the {len(bands)} bands from 2 % "
-        f"on are {errors}. Below 2 %, {number(round(light['found'] * light['frames']))} of {light['frames']} contacts found. "
-        f"In their {rest['frames']} frames at rest, {number(rest['contacts'])} reported."
+        f"on are {errors}. Below 2 %, {seen or 'none'} of {light['frames']} contacts {'are' if seen > 1 else 'is'} found. In "
+        f"their {rest['frames']} frames at rest, a contact is reported in {rest['contacts'] or 'none'}."
     )
 
 
@@ -26,15 +27,6 @@ def light_independent_summary(results: dict) -> dict:
     contacts = sum(row["contacts"] > 0 for row in rest)
     strokes = len({row["sensor"] for row in results["rows"]})
     return dict(strokes=strokes, bands=results["bands"], rest=dict(frames=len(rest), contacts=contacts))
-
-
-def number(count: int) -> str:
-    """How many contacts, with the verb.
-
-    >>> number(0), number(1), number(3)
-    ('none is', '1 is', '3 are')
-    """
-    return "none is" if count == 0 else f"{count} {'is' if count == 1 else 'are'}"
 
 
 def at_rest(found: dict) -> str:

@@ -264,7 +264,7 @@ def fuzz(found: dict) -> Rows:
 
 
 def fuzz_summary(results: dict) -> dict:
-    """Counts of every kind."""
+    """Of each kind of damaged file: cases, refusals, broken rules, slowest case and most memory."""
     kinds = {}
     for kind, each in results.items():
         refused = sum(count for what, count in each["kinds"].items() if what == "refused")

@@ -119,7 +119,9 @@ class Session:
                 f"the model of {self.name!r} does not track; expected one of dots from `torchmembrane export --tracking`"
             )
         if not hasattr(images, "__iter__"):
-            raise EdgeError(f"track: {type(images).__name__}; expected a video's images, one after another")
+            raise EdgeError(
+                f"track: images are of type {type(images).__name__}; expected an iterable of a video's images, in their order"
+            )
         previous = None
         for image in images:
             alone = [each if each is None else _array(each)[None] for each in image] if self.views else _array(image)[None]

@@ -159,9 +159,9 @@ class LightestTouch(NamedTuple):
 
     Attributes:
         strokes: number of strokes.
-        found: number of strokes in which the contact is found at all.
-        force: force at the first frame in which it is found, over those strokes.
-        depth: depth at the same frame.
+        found: number of strokes in which the contact is found in two successive frames.
+        force: magnitude of the true force in the first of these frames, force unit: median and 90 % quantile over the strokes.
+        depth: depth of the press in the same frame, length unit: likewise.
     """
 
     strokes: int

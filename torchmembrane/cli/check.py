@@ -29,7 +29,7 @@ examples:
 
 The command tests whether the rest surface is in equilibrium. It reports the force that tension and pressure leave unbalanced.
 It fits a sheet inflated in the same rim, and reports its distance from the surface and its pressure. With --overpressure, it
-compares the model's pressure with the gauge's. Of each difference it says how much it affects forces.
+compares the model's pressure with the gauge's. For each difference, it says how much the forces are affected.
 
 --accuracy presses the sensor in the simulator and reconstructs some 150 images. It reports the noise at rest, the lightest
 touch that is found, the errors of force, depth and contact point, the smallest distance at which two contacts are resolved,

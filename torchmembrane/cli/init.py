@@ -29,8 +29,8 @@ The command needs the shape and its lengths, the size of the image (--image-size
 --view) and the distance of the rim from the camera (--distance). For a dome, cap or bubble with --rest, the rim's circle in
 the image (--rim) replaces either the distance or the focal length. On a terminal, the command asks for missing numbers. The
 camera looks along the membrane's axis. In the file's frame, the origin is the camera's centre of projection, and +z points
-to the membrane. The dots are given as a list (--dots) or found in the rest image (--rest). Without both, the file gets a
-pattern of dots with the spacing --pitch.
+to the membrane. The dots are given as a list (--dots) or found in the rest image (--rest). With neither, the file gets
+a pattern of dots with the spacing --pitch.
 
 The list of dots is a CSV file with one of the headers
   x,y,z          in the camera's frame        x,y,h           h is the height above the rim's plane

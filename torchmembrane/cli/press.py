@@ -155,8 +155,8 @@ def _stroke(arguments: Namespace, simulator: Simulator) -> Stroke:
     touched = int(stroke.indenter.distance(membrane.rest).argmin())
     if float(membrane.rest_normals[touched] @ torch.from_numpy(stroke.travel)) > OUTWARDS:
         raise MembraneError(
-            f"--direction {_listed(arguments.direction)}: it would push the membrane from within; "
-            "expected the side that the indenter comes from, outside, as 0,0,1"
+            f"--direction {_listed(arguments.direction)}: the indenter would push the membrane from within; expected X,Y,Z "
+            "that points from the membrane to the indenter outside it, such as 0,0,1"
         )
     return stroke
 

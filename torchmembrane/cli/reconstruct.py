@@ -99,8 +99,8 @@ def _add_measured(add: Add) -> None:
     )
     add("--topic", metavar="[VIEW=]TOPIC", action="append", default=[], help=of_bags)
     messages = (
-        "of ROS 2 bags: also write the results as messages to a new bag (a folder), in SI units: wrench, its deviation, "
-        "tractions, contacts, status, and of a gas the pressure"
+        "for ROS 2 bags as input: also write the results as messages to a new bag (a folder), in SI units: wrench, its "
+        "deviation, tractions, contacts, status, and the absolute pressure if the filling is a gas"
     )
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = (

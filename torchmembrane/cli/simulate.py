@@ -127,7 +127,8 @@ def _add_sequence(add: Add) -> None:
     )
     stored = "format of --random: png and npz files, or a Parquet data set (extra parquet)"
     add("--format", choices=SIMULATION_FORMATS, default=SIMULATION_FORMATS[0], help=stored)
-    add("--increment", metavar="D", type=positive, help="longest motion in one step (default: a share of the membrane's size)")
+    longest = "longest motion in one step (default: a tenth of the membrane's size, with friction a hundredth)"
+    add("--increment", metavar="D", type=positive, help=longest)
 
 
 def _add_appearance(add: Add) -> None:

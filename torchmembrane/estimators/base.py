@@ -299,7 +299,7 @@ class Estimator(nn.Module, ABC):
         Raises:
             MembraneError: a measured pressure is of no use.
         """
-        raise self._without("pressure for")
+        raise self._without("use for a measured pressure")
 
     def gauged(self, observation: Observation, pressure: Tensor | float) -> Observation:
         """Add the pressure read by a gauge to the observation, `[B]` or `[]`, NaN without a reading; default: refused.
@@ -307,7 +307,7 @@ class Estimator(nn.Module, ABC):
         Raises:
             MembraneError: as for `check_gauge`, or the pressure has another shape.
         """
-        raise self._without("pressure for")
+        raise self._without("use for a measured pressure")
 
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: Tensor
@@ -324,10 +324,10 @@ class Estimator(nn.Module, ABC):
         Raises:
             MembraneError: this estimator has no standard deviations.
         """
-        raise self._without("standard deviations of")
+        raise self._without("standard deviations")
 
     def _without(self, what: str) -> MembraneError:
-        return MembraneError(f"Reconstructor: {what} {self.name}; expected estimator = 'force-balance'")
+        return MembraneError(f"Reconstructor: the estimator {self.name} has no {what}; expected estimator = 'force-balance'")
 
     @property
     def element(self) -> str:

@@ -96,11 +96,11 @@ class Row(NamedTuple):
         try:
             value = float(cell := self.text(column).translate(MINUS))
         except ValueError:
-            raise self.refusal(column, "a number with a decimal point") from None
+            raise self.refusal(column, "a number such as 12 or 1.5, with a point and not a comma") from None
         if not math.isfinite(value):
             raise self.refusal(column, "a finite number: leave the line out where it is unknown")
         if not NUMBER.fullmatch(cell):  # Python takes 1_000, and digits of other scripts
-            raise self.refusal(column, "a number with a decimal point")
+            raise self.refusal(column, "a number such as 12 or 1.5, with a point and not a comma")
         if abs(value) > limit.most:
             raise self.refusal(column, f"{limit.what} up to {limit.most:g}, in {limit.unit}")
         return value

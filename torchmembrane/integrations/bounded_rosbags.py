@@ -28,7 +28,7 @@ DEEPEST = 16
 
 @cache
 def bounded_rosbags() -> Any:
-    """Return the module `rosbags.highlevel`, patched for the whole process to unpack within bounds.
+    """Return the module `rosbags.highlevel`, patched for the whole process so that it refuses bags beyond these limits.
 
     Raises:
         MembraneError: rosbags is not installed.

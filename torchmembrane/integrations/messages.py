@@ -171,7 +171,10 @@ def camera_mismatch(info: Any, camera: Camera) -> str | None:
 
 
 def projected(info: Any, rays: np.ndarray) -> np.ndarray:
-    """Project `rays [..., 3]` with the lens of a CameraInfo to `[..., 2]` px of its mode; NaN behind a pinhole."""
+    """Project `rays [..., 3]` with the lens of a CameraInfo; return pixels `[..., 2]` of its mode.
+
+    For a pinhole lens, rays with z <= 0 give NaN.
+    """
     mode = mode_of(info)
     (f, g), (u, v) = mode.binned_focal, mode.binned_centre
     k = np.concatenate([np.asarray(info.d, float), np.zeros(8)])[:8]

@@ -42,7 +42,10 @@ def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstru
             or only relative ones, or the path holds something else.
     """
     if shard != WHOLE:
-        raise MembraneError("--bag with --shard: leave --bag out, and write the bag by one more call when all shards are done")
+        raise MembraneError(
+            "--bag with --shard: leave --bag out; when all shards are done, run the command once more with --bag and "
+            "without --shard"
+        )
     if not inputs.bags:
         raise MembraneError(f"--bag {path}: none of the inputs is a bag; expected one, because the results take its times")
     if not reconstructor.finds_tractions:

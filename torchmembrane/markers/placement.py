@@ -70,8 +70,8 @@ def imaged_vertices(sensor: Sensor, vertex_pixels: Tensor, whole: bool) -> Tenso
     imaged = torch.isfinite(vertex_pixels).all(-1)
     if not (imaged.all() if whole or sensor.markers.positions is None else imaged.any()):
         raise MembraneError(
-            f"sensor {sensor.name!r}: parts of the rest surface cannot be projected by its camera; check the poses (force "
-            "balance of listed dots can do with a part)"
+            f"sensor {sensor.name!r}: parts of the rest surface cannot be projected by its camera; check the poses of camera "
+            "and surface, or, if the camera sees only a part, list the dots and use the estimator force-balance"
         )
     return imaged
 

@@ -84,8 +84,8 @@ class AffineQuadrilaterals(nn.Module):
     def q_blocks(self, directions: Tensor, weight: Tensor | None = None) -> Tensor:
         """Return the paper's matrix Q (eq. 18) of every quadrilateral, `[..., m-1, n-1, 6, 4]`.
 
-        It maps the ranges of the four corners to the weighted entries of the affine map. The sum of `Q^T Q` over the
-        quadrilaterals is `K`.
+        It maps the ranges of the four corners to the six entries of the affine map, times `sqrt(tension x area x weight)`. The
+        sum of `Q^T Q` over the quadrilaterals is `K`, the stiffness matrix of the energy in the ranges.
 
         Args:
             directions: unit directions of the rays, `[..., V, 3]`.

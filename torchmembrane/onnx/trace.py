@@ -115,14 +115,19 @@ def _free(graph: ir.Graph) -> None:
     for node in list(graph):
         given = [] if node.op_type == "Constant" else node.attributes.values()
         if any(_depends(np.asarray(each.value)) for each in given if each.type in NUMBERS):
-            raise ValueError(f"the batch size is an attribute of {node.op_type}")
+            raise ValueError(
+                f"the batch size is a fixed attribute of {node.op_type}; compute each frame independently of the others"
+            )
         for k, value in enumerate(node.inputs):
             constant = None if value is None else ir.convenience.get_const_tensor(value)
             if constant is None or constant.size > LENGTHS or not _depends(constant.numpy()):
                 continue
             numbers = constant.numpy()
             if numbers.dtype != np.int64:
-                raise ValueError(f"{node.op_type} depends on the batch size, as a number")
+                raise ValueError(
+                    f"{node.op_type} computes with the batch size as a value, not as a length, so that the model would hold "
+                    "for one batch size only; compute each frame independently of the others"
+                )
             of_batch = numbers % MANY == 0
             if node.op_type == "Reshape" and of_batch.sum() == 1 and (numbers > 0).all():
                 free = [ir.node("Constant", [], {"value": ir.tensor(np.where(of_batch, -1, numbers))})]

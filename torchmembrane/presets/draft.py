@@ -184,9 +184,9 @@ def balanced(
         most = held(LARGEST_STRETCH)
         if not 0 < stated < most:
             raise MembraneError(
-                f"init: overpressure {stated:g} hPa; expected more than 0 and less than {most:.4g}, what this membrane holds "
-                f"at a prestretch of {LARGEST_STRETCH:g}: check unit, shear modulus and thickness, and that it is over the "
-                "surroundings' pressure, not absolute"
+                f"init: overpressure {stated:g} hPa; expected more than 0 and less than {most:.4g} hPa, which this membrane "
+                f"holds at a prestretch of {LARGEST_STRETCH:g}: check unit, shear modulus and thickness, and that the "
+                "pressure is relative to the surroundings, not absolute"
             )
         prestretch = float(brentq(lambda stretch: held(stretch) - stated, 1.0, LARGEST_STRETCH))
         return Material("neo_hookean", round(prestretch, 6), None, shear_modulus, thickness), [

@@ -46,7 +46,7 @@ class Reconstruction(NamedTuple):
     markers           [B, D, 3]  3-D positions of the markers, in the sensor file's order (always on the surface)
     pixels            [B, D, 2]  the model's rest pixel plus the measured displacement; NaN if lost
     confidence        [B, D]     0..1, 0 = lost
-    traction          [B, V, 3]  contact force per area (zero for minimum energy, which assumes that there is none)
+    traction          [B, V, 3]  contact force per rest area (zero for minimum energy, which assumes that there is none)
     contact           [B, V]     contact indicator, 0..1
     contact_points    [B, 4, 3]  centroids of the contact patches, NaN-padded
     force             [B, 3]     total contact force, the integral of traction

@@ -316,8 +316,11 @@ def spreads_of(
     wanted: Tensor,
     by_pressure: Tensor,
 ) -> Tensor:
-    """Return standard deviations `[B, L]` of numbers with the derivatives `wanted [B, L, 3 N]` in the inner vertices and
-    `by_pressure [B, L]` in the pressure, for a standard deviation of 1 of all angles, and that of a gauge."""
+    """Return the standard deviations `[B, L]` of L numbers that are computed from a solution.
+
+    The noise is that of the markers' weighted angles (standard deviation 1) and, if there is one, that of the gauge. The
+    numbers have the derivatives `wanted [B, L, 3 N]` in the N inner vertices and `by_pressure [B, L]` in the pressure.
+    """
     solved = solution.solve(torch.cat([wanted, solution.borders], 1))
     y, of_gauge = solved[:, :-2], torch.zeros_like(by_pressure)
     if solution.corner is not None:

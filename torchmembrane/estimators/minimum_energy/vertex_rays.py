@@ -65,7 +65,7 @@ class VertexRays(Estimator):
 
     @classmethod
     def interpolation(cls, problem: Problem, settings: Any) -> FlowInterpolation:
-        """Return the interpolation of the flow between the sensor's markers; default: smooth."""
+        """Return the interpolation of the flow between the markers: the smooth one, unless a subclass returns another."""
         return FlowInterpolation(problem.membrane, problem.markers)
 
     def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:

@@ -104,8 +104,11 @@ class NeighbourAgreement(nn.Module):
 
     @traced
     def exchange(self, messages: Tensor, own: Tensor, pair: Tensor) -> tuple[Tensor]:
-        """Return the next messages `[B, E, C + 1]`: the cost of each choice at the end of an edge for its beginning and for all
-        dots behind that, averaged with the previous messages for damping."""
+        """Return the next messages `[B, E, C + 1]`, each the mean of the new and the previous message, for damping.
+
+        The message of an edge gives, for each choice of the dot at its end, the least cost that the dot at its beginning and
+        the dots behind that one can reach.
+        """
         behind = self.beliefs(messages, own).index_select(1, self.source) - messages.index_select(1, self.reverse)
         told = (behind[..., None] + pair).amin(-2)
         return ((messages + told - told.amin(-1, keepdim=True)) / 2,)

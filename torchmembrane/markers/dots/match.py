@@ -31,12 +31,12 @@ class DotMatcher(nn.Module):
     searched for: the pattern is aligned with the blobs as a whole (`Alignment`), then neighbours agree on their blobs
     (`NeighbourAgreement`), repeatedly from the positions found before. A few steps then predict every dot from the confident
     dots around it and the local deformation, choose the nearest blob of its size, and keep it if the choice is mutual. If some
-    dots are lost, those that took another's blob are released and may find their own. The result depends on which blob belongs
-    to which dot alone, not on how this was found.
+    dots are lost, those that took another's blob are released and may find their own. The result depends only on which blob
+    belongs to which dot, not on how this was found.
 
     Args:
         pixels: centres of the dots at rest, `[D, 2]`, px.
-        log_radius: log radii from the blob detector at rest, `[D]`.
+        log_radius: natural logarithms of the radii, px, that the blob detector finds at rest, `[D]`.
         size_tolerance: standard deviation of a dot's log radius.
         seen: which of them are in the image at rest, `[D]` bool.
 

@@ -156,7 +156,10 @@ class SoftLocator(nn.Module):
         return values[:, self.large]
 
     def levels(self, dark: Tensor) -> list[Tensor]:
-        """Pyramid of the logarithm of images `[B, 1, H, W]`, in which uneven light only adds; zero off the membrane."""
+        """Return the pyramid, from fine to coarse, of the logarithm of images `dark [B, 1, H, W]`, zero off the membrane.
+
+        In the logarithm, uneven light is a smooth summand.
+        """
         return pyramid((dark.clamp(0, 1) / REFERENCE_GREY + LEAST_GREY_SHARE).log() * self.inside)
 
     @traced
