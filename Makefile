@@ -8,7 +8,7 @@
 # make test-ros: the node of ROS 2 under rclpy of PyPI in .venv-ros; needs Python 3.11, on Linux.
 # make test-dist: sdists and wheels of the three packages in out/dist, used from empty environments; of what is committed.
 # make docs: the site in out/site, links checked.
-# make measure PARTS="frame training" INDEPENDENT=FOLDER: measures what the documents quote and writes their tables; without PARTS
+# make measure PARTS="frame training" INDEPENDENT=FOLDER RECORDINGS=FOLDER: measures what the documents quote and writes their tables; without PARTS
 #   what has changed since it was measured, hours in all. make measured says what was measured when, and what is old.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 # make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
@@ -125,7 +125,7 @@ bench: $(READY)
 	$(BIN)/python -m bench.speed.speed --json out/bench/speed.json
 
 measure: $(READY)
-	$(BIN)/python -m bench.measure.measure $(PARTS) $(if $(INDEPENDENT),--independent $(INDEPENDENT))
+	$(BIN)/python -m bench.measure.measure $(PARTS) $(if $(INDEPENDENT),--independent $(INDEPENDENT)) $(if $(RECORDINGS),--recordings $(RECORDINGS))
 
 measured: $(READY)
 	$(BIN)/python -m bench.measure.measure --list

@@ -156,10 +156,10 @@ def recorded_in(folder: Path, monkeypatch: pytest.MonkeyPatch, part: Part) -> No
 def test_a_part_leaves_a_record_of_what_was_measured_where_and_when(commit, tmp_path, monkeypatch):
     recorded_in(tmp_path, monkeypatch, Part("made --turns 5", ()))
     with pytest.raises(SystemExit, match=r"commit made\.py first"):
-        measure.measure("made", None)
+        measure.measure("made", {})
     assert measure.is_due("made") and measure.state("made") == "never measured"
     revision = commit("made.py")
-    measure.measure("made", None)
+    measure.measure("made", {})
     found = pages.record("made")
     assert found["command"] == "python -m made --turns 5" and found["revision"] == revision and found["processor"] == "A"
     assert found["results"] == {"rows": [{"ms": 1.2346, "each": [1, 2]}]}
@@ -175,7 +175,7 @@ def test_the_latest_results_of_other_processors_are_kept(commit, tmp_path, monke
     for processor in "ABA":
         monkeypatch.setenv("PROCESSOR", processor)
         revisions[processor] = commit("made.py", f"# {len(revisions)}")
-        measure.measure("made", None)
+        measure.measure("made", {})
     found = pages.record("made")
     assert found["processor"] == "A" and list(found["results"]) == ["A", "B"]
     assert {name: each["revision"] for name, each in found["results"].items()} == revisions
@@ -186,7 +186,7 @@ def drifts(part, **of):
     return [dict(part=part, said=9, drift=0.2, contacts=0, early=False, kind="sags") | of]
 
 
-PRESS = dict(kind="press", width=2.0, at_rim=False, surface=0.1, force=0.1, spacing=1.0, size=10.0, moment=0.2, slip=0.01)
+PRESS = dict(kind="press", width=2.0, at_rim=False, surface=0.1, force=0.1)
 ABOUT = dict(filling="gas", prestretch=1.05, dots=90, markers="dots", seen=1.0, clear=0.3)
 THREE = (0, 0.01, 0.1), (0, 0.15, 0.9), (9, 0.25, 0.1)  # status, depth and error: right, wrong with ok, right with a status
 RAW = {
@@ -291,12 +291,3 @@ def test_the_paragraph_on_the_range_counts_right_presses_with_any_status():
     said = readme_range(SUMMARIES["range"](RAW["range"]))
     assert "50 % are right, 50 % with status `ok`" in said
     assert "0.3 of the size 100 % are right, 0 % with status `ok`" in said and "one in 3 is wrong" in said
-
-
-def test_the_paragraph_on_contacts_counts_those_clear_of_the_rim():
-    """Of presses that end 0.3 of the size off the rim, one of three is said to be at it; errors are of those with status ok."""
-    raw = [row | dict(at_rim=k == 0, curvature=0.1) for k, row in enumerate(RAW["range"]["rows"])]
-    said = TABLES["range-contacts"][1](SUMMARIES["range"](dict(rows=[row | dict(patch_force=0.02) for row in raw])))
-    assert (
-        "wrongly for 1 of the 3 contacts" in said and "0.2 / 0.2 length units" in said and "0.02 / 0.02 for the force" in said
-    )

@@ -270,16 +270,7 @@ def range_summary(results: dict) -> dict:
         counts["cautious"] = sum(row["status"] != 0 and is_right(row) for row in chosen)
         shares = {key: count / max(len(chosen), 1) for key, count in counts.items()}
         found.append(dict(name=name, presses=len(chosen), digits=3 if name == "all" else 2, **shares))
-    return dict(groups=found, **contacts_summary(wide))
-
-
-def contacts_summary(wide: list[dict]) -> dict:
-    """How often `contact_at_rim` is set of contacts that are clear of the rim, and errors of what contacts are told to do."""
-    off_rim = [row["at_rim"] for row in wide if row["clear"] > max(0.1, row["spacing"] / row["size"])]
-    clear, errors = [row for row in wide if row["status"] == 0 and row["clear"] > 0.1], {}
-    for key in ("moment", "patch_force", "slip", "curvature"):
-        errors[key] = np.nanquantile([row[key] for row in clear if key in row], (0.5, 0.9)).tolist()
-    return dict(at_rim=dict(contacts=len(off_rim), wrong=sum(off_rim)), errors=errors)
+    return dict(groups=found)
 
 
 def intervals(found: dict) -> Rows:

@@ -1,6 +1,6 @@
 """Measures what the documents quote, part by part, and writes their tables.
 
-python -m bench.measure.measure [PART ...] [--list] [--tables] [--independent FOLDER]
+python -m bench.measure.measure [PART ...] [--list] [--tables] [--independent FOLDER] [--recordings FOLDER]
 
 Without a PART, those parts are measured that were never measured or whose code has changed since; an interrupted run is taken
 up again where it ended. Every part writes docs/measured/PART.json with its results, the revision, date, processor and seconds,
@@ -39,6 +39,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true")
     parser.add_argument("--tables", action="store_true")
     parser.add_argument("--independent", type=Path)
+    parser.add_argument("--recordings", type=Path)
     args = parser.parse_args()
     if unknown := set(args.parts) - set(PARTS):
         parser.error(f"no such part: {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
@@ -47,7 +48,7 @@ def main() -> None:
         return
     if not args.tables:
         for name in args.parts or [name for name in PARTS if is_due(name)]:
-            measure(name, args.independent)
+            measure(name, dict(independent=args.independent, recordings=args.recordings))
     write_pages()
 
 
@@ -68,14 +69,14 @@ def is_due(name: str) -> bool:
     return found is None or bool(changes_since(found["revision"], PARTS[name].paths))
 
 
-def measure(name: str, independent: Path | None) -> None:
-    """Run a part and write its record."""
+def measure(name: str, elsewhere: dict[str, Path | None]) -> None:
+    """Run a part and write its record; `elsewhere` are the folders of data that are not distributed."""
     part = PARTS[name]
     if changed := uncommitted(part.paths):
         sys.exit(f"measure {name}: commit {', '.join(changed)} first, so that the record can name a revision")
-    folder = independent if part.data == "independent" else OUT / str(part.data)
+    folder = elsewhere[part.data] if part.data in elsewhere else OUT / str(part.data)
     if folder is None:
-        print(f"{name}: left out, its data are not distributed; --independent FOLDER names them")
+        print(f"{name}: left out, its data are not distributed; --{part.data} FOLDER names them")
         return
     if part.needs_gpu and not torch.cuda.is_available():
         print(f"{name}: left out, torch finds no GPU here")

@@ -19,6 +19,7 @@ RANDOM_SENSORS = "bench.data.random_sensors DATA"
 MADE = {
     "cases": ("bench.data.cases CASES",),
     "independent": (),
+    "recordings": (),
     "light": (f"{RANDOM_SENSORS} --sensors 20 --presses 0 --light 54 --seed 2026",),
     "gauge": (f"{RANDOM_SENSORS} --sensors 14 --presses 2 --light 8",),
     "intervals": tuple(f"{RANDOM_SENSORS}/{seed} --sensors 40 --presses 2 --light 6 --seed {seed}" for seed in SEEDS),
@@ -28,9 +29,8 @@ MADE = {
     "precision": (),
     "live-exported": (),
 }
-"""Folders of data, and what makes them. Nothing makes the independent ones: `make measure INDEPENDENT=FOLDER` names them;
-`precision` and
-`live-exported` make their own."""
+"""Folders of data, and what makes them. Nothing makes `independent` and `recordings`, which are not distributed: `make measure
+INDEPENDENT=FOLDER RECORDINGS=FOLDER` names them. `precision` and `live-exported` make their own."""
 
 
 class Part(NamedTuple):
@@ -127,6 +127,10 @@ PARTS = {
         f"bench.accuracy.light {' '.join(f'CASES/light/{name}' for name in ('l01', 'l04', 'l06', 'l07'))}", data="independent"
     ),
     "simulator-independent": Part("bench.accuracy.simulator CASES", SIMULATOR, data="independent"),
+    "real-bubble": Part("bench.accuracy.real_bubble DATA/punyo", data="recordings"),
+    "real-pins": Part(
+        "bench.accuracy.real_pins DATA", (*FRAME, "torchmembrane/cli", "torchmembrane/presets"), data="recordings"
+    ),
     "cases": Part("bench.accuracy.accuracy CASES", CASES, data="cases"),
     "locators": Part("bench.accuracy.locators CASES", ("torchmembrane/markers", "bench/data/cases.py"), data="cases"),
     "segmentation": Part("bench.accuracy.segmentation CASES", CASES, data="cases"),

@@ -38,17 +38,6 @@ def pins_summary(results: dict) -> dict:
     return dict(groups=groups)
 
 
-def contacts(found: dict) -> str:
-    """A paragraph on what is told of the contacts of random presses."""
-    rim, of = found["at_rim"], {key: "{:.2g} / {:.2g}".format(*pair) for key, pair in found["errors"].items()}
-    return (
-        f"`contact_at_rim` is set wrongly for {rim['wrong']} of the {rim['contacts']} contacts that are at least 0.1 of the "
-        f"size and a spacing of the dots away from the rim. For contacts away from the rim, the errors (median / 90 %) are "
-        f"{of['moment']} length units for moment over force (the rims' radii are 8 to 60), {of['patch_force']} for the force "
-        f"of the patch, {of['slip']} for the slip ratio, and {of['curvature']} for the curvature of spheres."
-    )
-
-
 def by_depth(found: dict) -> tuple[dict[str, int], dict[str, int]]:
     """Of presses up to a fifth of the size deep, and of deeper ones: %, right with any status, right with ok, wrong with ok."""
     groups = found["groups"]

@@ -1,18 +1,22 @@
 """Tables of time and size: rows of cells, the first of which is the head, from the results of parts."""
 
 from bench.measure.accuracy_tables import Rows, default_accuracy
+from bench.measure.recording_tables import balanced
 
 TRACKED = "tracked, from the frame before"
 
 
-def readme(independent: dict, frame: dict, live: dict) -> Rows:
+def readme(independent: dict, bubble: dict, frame: dict, live: dict) -> Rows:
+    """What to expect, at a glance."""
     head, surface, contact, force, _ = default_accuracy(independent)
+    poke = balanced(bubble)["depth"], balanced(bubble)["rms_contact"]
     times = [f"{medians(found['rows'])} ms ({processor})" for processor, found in frame.items()]
     return [
         head,
         ["shape, relative to the displacement", *surface[1:]],
         contact,
         force,
+        ["rms error of the shape of a real bubble, poked {:.1f} mm deep".format(*poke), "{:.2f} mm".format(*poke[1:]), ""],
         ["processor time of one image / in batches / tracked", "; ".join(times), ""],
         ["latency of a live camera of 30 Hz", f"{live['cases']['default grid']['median']:.0f} ms", ""],
     ]

@@ -8,6 +8,7 @@ import bench.measure.calibration_tables as calibration
 import bench.measure.paper_tables as paper
 import bench.measure.paragraphs as paragraphs
 import bench.measure.range_tables as working_range
+import bench.measure.recording_tables as recordings
 import bench.measure.robustness_tables as robustness
 import bench.measure.scaling_tables as scaling
 import bench.measure.simulator_tables as simulator
@@ -15,7 +16,7 @@ import bench.measure.speed_tables as speed
 from bench.measure.parts import PARTS
 
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = {
-    "readme": (("independent", "frame", "live"), speed.readme),
+    "readme": (("independent", "real-bubble", "frame", "live"), speed.readme),
     "accuracy-independent": (("independent",), accuracy.default_accuracy),
     "accuracy-cases": (("cases",), accuracy.default_accuracy),
     "estimators-independent": (("independent",), accuracy.estimators),
@@ -64,10 +65,16 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = 
     "views-deep-and-soft": (("views-deep", "views-soft"), accuracy.deep_and_soft_views),
     "knocked": (("knocked",), accuracy.knocked),
     "range": (("range",), accuracy.working_range),
-    "range-contacts": (("range",), working_range.contacts),
     "readme-range": (("range",), working_range.readme_range),
     "limits": (("range", "light", "intervals", "degraded-images", "weight"), working_range.limits),
     "pins": (("pins",), working_range.pins),
+    "bubble-surface": (("real-bubble",), recordings.bubble_surface),
+    "bubble-estimators": (("real-bubble",), recordings.bubble_estimators),
+    "bubble-forces": (("real-bubble",), recordings.bubble_forces),
+    "bubble-gauge": (("real-bubble",), recordings.bubble_gauge),
+    "tactip": (("real-pins",), recordings.tactip),
+    "finger": (("real-pins",), recordings.finger),
+    "finger-levers": (("real-pins",), recordings.finger_levers),
     "drift": (("drift",), robustness.drift),
     "life": (("life",), robustness.life),
     "mistakes": (("mistakes",), robustness.mistakes),
@@ -115,6 +122,7 @@ SUMMARIES: dict[str, Callable[[dict], dict]] = {
     "rough-gauge": accuracy.gauge_summary,
     "light-independent": paragraphs.light_independent_summary,
     "exports": paragraphs.exports_summary,
+    "real-bubble": recordings.bubble_summary,
     "intervals": accuracy.intervals_summary,
     "views": accuracy.views_summary,
     "views-deep": accuracy.views_summary,
