@@ -170,8 +170,8 @@ def photographed(finger: Finger) -> dict:
 
 def other_files(s: tm.Sensor) -> dict[str, tm.Sensor]:
     """Return the finger's sensor with other materials and fillings."""
-    cavities = {"open": tm.Cavity("open"), "liquid": tm.Cavity("liquid"), "gas": tm.Cavity("gas", 1013.0)}
-    files = {f"prestretch {value}": replace(s, material=replace(s.material, prestretch=value)) for value in (1.02, 1.1, 1.3)}
+    cavities = {"liquid": tm.Cavity("liquid"), "gas": tm.Cavity("gas", 1013.0)}
+    files = {f"prestretch {value}": replace(s, material=replace(s.material, prestretch=value)) for value in (1.02, 1.3)}
     files |= {name: replace(s, cavity=cavity) for name, cavity in cavities.items()}
     return files | {"harmonic": replace(s, material=replace(s.material, model="harmonic"))}
 
