@@ -331,17 +331,8 @@ class Reconstructor(nn.Module):
         return {name: principal_fields(elasticity, self.estimator.membrane, result.vertices, name) for name in names}
 
     def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
-        """Return the standard deviations of the vertices, the total force and the pressure of `result`.
-
-        They are caused by the locator's noise and, if `pressure` was given, by the gauge's noise.
-
-        Args:
-            result: a result of this reconstructor.
-            pressure: readings of a gauge with which it was computed, as in `forward`; None if there were none.
-
-        Returns:
-            Deviations of vertices `[B, V, 3]`, force `[B, 3]` and pressure `[B]`, in the units of `result`; NaN where there is
-            no surface.
+        """Return the standard deviations of vertices `[B, V, 3]`, total force `[B, 3]` and pressure `[B]` due to the noise of
+        the locator and, if `result` was computed with readings `pressure`, of the gauge; NaN without a surface.
 
         Raises:
             MembraneError: the estimator does not compute standard deviations.

@@ -54,8 +54,8 @@ def bubble_surface(found: dict) -> str:
     of = balanced(found)
     return (
         f"On a **real** air-filled bubble, {of['contact']} photographs of a poke up to {of['depth']:.1f} mm deep were compared "
-        f"with a depth camera. The rms error over the whole surface is {of['rms_contact']:.2f} mm. For comparison, the error of "
-        f"a surface without any displacement would be {of['none_contact']:.2f} mm, and the depth camera's own noise is "
+        f"with a depth camera. The rms error over the whole surface is {of['rms_contact']:.2f} mm. For comparison, the error "
+        f"of a surface without any displacement would be {of['none_contact']:.2f} mm, and the depth camera's own noise is "
         f"{of['none_before']:.3f} mm. While the poke is held still, the depth of the deepest point is within "
         f"{100 * abs(of['deepest']):.0f} % of that of the depth camera, and its position within {of['away']:.0f} px. "
         f"{of['ok']} of the {of['frames']} photographs have status ok."
