@@ -591,7 +591,7 @@ def test_wrong_arguments_are_named():
     pattern = DotPattern(s.pixels, s.shapes, s.sizes)
     with pytest.raises(MembraneError, match="polarity is 'black'"):
         DotLocator(pattern, SIZE, "black")
-    with pytest.raises(MembraneError, match="1 of them NaN"):
+    with pytest.raises(MembraneError, match=f"{len(s.pixels)} dots, {len(s.pixels) - 1} of them at finite pixels"):
         s.pixels[4] = np.nan
         DotLocator(pattern, SIZE, "dark")
 

@@ -289,5 +289,5 @@ def test_what_a_benchmark_writes_gives_its_table(part):
 def test_the_paragraph_on_the_range_counts_right_presses_with_any_status():
     """Of two shallow presses one is right; the deep one is right and out of range; of all three one is wrong with ok."""
     said = readme_range(SUMMARIES["range"](RAW["range"]))
-    assert "50 % are right, 50 % with status `ok`" in said
-    assert "0.3 of the size 100 % are right, 0 % with status `ok`" in said and "one in 3 is wrong" in said
+    assert "50 % are right, and 50 % are right and have status `ok`" in said
+    assert "0.3 of the size, these shares are 100 % and 0 %" in said and "one in 3 is wrong" in said

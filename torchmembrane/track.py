@@ -178,7 +178,10 @@ class Tracker:
         if result is None:
             raise MembraneError(f"Tracker.{name}: no frame yet; expected one with the load")
         if int(result.status[0]) != Status.OK:
-            raise MembraneError(f"Tracker.{name}: the latest frame is not ok ({Status(int(result.status[0])).text})")
+            raise MembraneError(
+                f"Tracker.{name}: the latest frame is not ok ({Status(int(result.status[0])).text}); expected status ok: "
+                "apply the load again and pass another frame"
+            )
         if unit != "N":
             raise MembraneError(f"Tracker.{name}: forces are {unit}; expected a sensor file with shear_modulus and thickness")
         return result

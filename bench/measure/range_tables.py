@@ -56,9 +56,10 @@ def readme_range(found: dict) -> str:
     """A paragraph on how deep a press may be."""
     (of, deep), every = by_depth(found), round(1 / found["groups"][0]["wrong"])
     return (
-        f"Of the presses of random sensors that are up to a fifth of the membrane's size deep, {of['right']} % are right, "
-        f"{of['ok']} % with status `ok`; of those from there to 0.3 of the size {deep['right']} % are right, {deep['ok']} % "
-        f"with status `ok`. Of all presses, one in {every} is wrong although its status is `ok`."
+        f"Of the presses of random sensors that are up to a fifth of the membrane's size deep, {of['right']} % are right, and "
+        f"{of['ok']} % are right and have status `ok`; from there to 0.3 of the size, these shares are {deep['right']} % and "
+        f"{deep['ok']} %. Of all presses, one in {every} is wrong although its status is `ok`. A press is right if the errors "
+        f"of its surface and force are below a quarter (a force at the rim may be a lower bound)."
     )
 
 

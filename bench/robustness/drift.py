@@ -51,7 +51,7 @@ class Aged:
             return self.simulator.renderer(vertices)
 
     def taken(self, clean: torch.Tensor) -> np.ndarray:
-        """As the chip delivers it."""
+        """Return the image with the sensor's noise, rounded to uint8, as a camera delivers it."""
         return (255 * noisy(clean, self.noise, self.rng)).round().byte().numpy()
 
     def displaced(self, kind: str) -> torch.Tensor:

@@ -35,7 +35,8 @@ HEIGHT_SHARE = 0.15  # share of the time that losses at another height of the re
 
 class MeasuredPresses(NamedTuple):
     """Measurements of presses: the markers' displacement `[B, D, 2]` px and confidence `[B, D]`; forces and pressures as for
-    `material_from_pixels`; the rest surface's height; the displacements' covariance (default: the rest image's)."""
+    `material_from_pixels`; the gauge's reading at rest, hPa; the prior of the rest surface's height; the displacements'
+    covariance `[B, D, 2, 2]`, px^2 (default: twice the rest image's)."""
 
     displacement: Tensor
     confidence: Tensor

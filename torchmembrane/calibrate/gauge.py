@@ -66,9 +66,9 @@ def modulus_from_pressures(
     worst = int(np.nanargmax(abs(off)))
     if spare and abs(off[worst]) > CONTRADICTION:
         raise MembraneError(
-            f"calibrate material: the readings contradict each other: image {worst + 1}'s is {readings[worst]:.4g}, by the "
-            f"others {ratio * at.change[worst] + offset:.4g}; expected readings of one gauge, taken with the images, of a "
-            "cavity that does not leak"
+            f"calibrate material: the readings contradict each other: that of image {worst + 1} (in the order of the call) is "
+            f"{readings[worst]:.4g}, and the others predict {ratio * at.change[worst] + offset:.4g}, in force / length^2 "
+            "(1 hPa = 1e-4 N/mm^2); expected readings of one gauge, taken with the images, of a cavity that does not leak"
         )
     scatter = max(1.0, np.sqrt(np.nansum(off**2) / spare)) if spare else 1.0
     return GaugeModulus(modulus, modulus * deviation * scatter / response, np.stack([at.change, readings - offset], -1))
@@ -82,8 +82,8 @@ def _line(change: np.ndarray, readings: np.ndarray, sigma: np.ndarray, since_res
     if information * UNSURE**2 < 1:
         remedy = "pressed images with their readings" if since_rest else "an image at rest and pressed ones with their readings"
         raise MembraneError(
-            "calibrate material: the images with readings show pressure changes of at most "
-            f"{np.abs(change - centre).max():.3g}, too little to determine the modulus; expected {remedy}"
+            "calibrate material: in the images with readings, the reconstructed pressure varies by at most "
+            f"{np.abs(change - centre).max():.3g} (force / length^2), too little to determine the modulus; expected {remedy}"
         )
     slope = (w * (change - centre) * readings).sum() / information
     if not slope > 0:

@@ -37,7 +37,10 @@ def lens_and_poses(camera: Camera, board: Checkerboard, pixels: np.ndarray) -> t
             exact = [[a.astype(np.float64) for a in arrays] for arrays in (points, imaged)]
             _, K, k, rotation_vectors, translations = cv2.fisheye.calibrate(*exact, size, K, np.zeros(4), flags=flags)
     except cv2.error as error:
-        raise MembraneError(f"calibrate camera: OpenCV finds no {camera.model} lens for these images ({error})") from error
+        raise MembraneError(
+            f"calibrate camera: OpenCV cannot fit a {camera.model} lens to these images ({error}); expected some ten sharp "
+            "images with the board tilted in different ways, right --corners, and a first focal length near the true one"
+        ) from error
     poses = np.concatenate([np.reshape(rotation_vectors, (-1, 3)), np.reshape(translations, (-1, 3))], 1)
     k = np.ravel(k)[:count]
     return Camera(camera.model, size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), k.tolist()), poses

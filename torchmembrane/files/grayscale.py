@@ -79,7 +79,7 @@ def check_image(name: str, image: np.ndarray, size: tuple[int, int] | None = Non
     array = np.asarray(image)
     if array.ndim != 2 or array.size == 0 or size not in (None, array.shape[::-1]):
         expected = "[H, W]" if size is None else f"[{size[1]}, {size[0]}], the camera's"
-        raise MembraneError(f"{name} is {list(array.shape)}; expected {expected}")
+        raise MembraneError(f"{name} has the shape {list(array.shape)}; expected {expected}")
     return array
 
 

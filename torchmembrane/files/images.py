@@ -233,7 +233,7 @@ def mean_image(paths: Sequence[Path], bits: int | None = None) -> np.ndarray:
     for path in paths[1:]:
         if (size := image_size(path)) != first:
             sizes = ["{} x {}".format(*each) for each in (size, first)]
-            raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as in {paths[0]}: give images of one mode")
+            raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as in {paths[0]}: give images of one size")
     total = np.zeros(first[::-1])
     for path in paths:
         total += read_image(path, first, bits)

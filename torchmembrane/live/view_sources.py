@@ -24,8 +24,8 @@ PATIENCE = 0.2
 def moments_of_cameras(cameras: Mapping[str, Iterator[Captured]]) -> Iterator[Captured]:
     """Yield the images of several cameras for each moment: as soon as every camera has a new picture, the newest of each.
 
-    A camera that delivers no picture for `PATIENCE` seconds has none at this moment. If a camera stops for good, this is
-    reported once, and the others continue.
+    A camera that delivers no picture for `PATIENCE` seconds has none at this moment. If a camera ends with a `MembraneError`, a
+    warning says so and the others continue; a camera that ends without an error is left out silently.
 
     Args:
         cameras: the images of each camera as they arrive, by the name of its view.
@@ -34,7 +34,8 @@ def moments_of_cameras(cameras: Mapping[str, Iterator[Captured]]) -> Iterator[Ca
         For each view its image, or None.
 
     Raises:
-        BaseException: the error that ended the last camera.
+        MembraneError: the error that ended the last camera.
+        BaseException: any other error of any camera.
     """
     with ExitStack() as stack:
         boxes: dict[str, Mailbox] = {name: stack.enter_context(capture(images)) for name, images in cameras.items()}

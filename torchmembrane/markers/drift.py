@@ -4,8 +4,9 @@ Temperature, creep, swelling, pressure or a moved camera displace all markers sl
 the displacements in frames without contact is whitened by the noise of the rest image, which is the same in all frames, and
 projected on polynomials of the image position. `S` is the sum of squares of the `k` coefficients, and `U` is that of the
 remainder. With noise alone, `S / v` follows a chi-squared distribution with k degrees of freedom, where
-`v = 1 + share x scatter` adds the noise that remains in the mean of the frames. With a harmless drift of `LEAST_DRIFT`, the
-distribution is noncentral, with parameter `lambda`. Therefore
+`v = 1 + share x scatter` adds the noise that remains in the mean of the frames: `scatter` is the variance of a coefficient from
+frame to frame, and `share` is the part of it that the mean keeps. With a harmless drift of `LEAST_DRIFT`, the distribution is
+noncentral, with parameter `lambda`. Therefore
 
     z = (S / v - k - lambda) / sqrt(2 k + 4 lambda)
 

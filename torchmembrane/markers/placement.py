@@ -181,8 +181,8 @@ def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, n
     placed = np.isfinite(hits.distance)
     if placed.sum() < FEWEST_MARKERS:
         raise MembraneError(
-            f"sensor {sensor.name!r}: {placed.sum()} markers found in the rest image lie on the rest surface; expected at "
-            f"least {FEWEST_MARKERS}: check the camera, the rest surface and the polarity"
+            f"sensor {sensor.name!r}: of {len(pixels)} markers found in the rest image, the rays of {placed.sum()} meet the "
+            f"rest surface; expected at least {FEWEST_MARKERS}: check the camera, the rest surface and the polarity"
         )
     feet, to_tips = ((each[hits.vertices] * hits.weights[..., None]).sum(1)[placed] for each in (X, levers))
     return feet, to_tips if height else None, placed

@@ -69,7 +69,7 @@ def blown_up(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
     """
     height, overpressure, prestretch, shear_modulus, thickness = stated
     if height is None and overpressure is None:
-        raise MembraneError("init: an inflated sheet; expected its --height, its --overpressure, or both")
+        raise MembraneError("init: neither --height nor --overpressure is given; an inflated sheet needs one of them, or both")
     if height is None:
         return _by_pressure(rim, unit, stated)
     one, said = hectopascal(unit), []

@@ -52,8 +52,8 @@ class Stroke(NamedTuple):
     friction: float = 0.0
 
     def poses(self, legs: Sequence[str], frames: int, lift: float) -> list[Indenter]:
-        """Return `frames` equidistant poses on each of the `legs`, "push", "slide", "release"; the release ends `lift`
-        above."""
+        """Return `frames` equidistant poses on each of the `legs`, "push", "slide", "release"; the release ends `lift` (length
+        unit) beyond the first contact, off the membrane."""
         offsets: list[np.ndarray] = []
         here = np.zeros(3)
         motion = {"push": self.depth * self.travel, "slide": self.slide, "release": -(self.depth + lift) * self.travel}

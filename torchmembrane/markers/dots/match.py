@@ -205,8 +205,12 @@ class DotMatcher(nn.Module):
 
     @traced
     def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the result of `search`, but from the previous frames and in the `unstrained` scene; and in which frames `[B]`
-        all dots that were found could be followed."""
+        """Follow the dots from their previous pixels (without them, from rest), in the `unstrained` scene.
+
+        Returns:
+            Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]`, as `search` does; and `[B]` bool, whether every dot
+            that was found in the previous frame was found again.
+        """
         flow, found = self.flow_before(previous)
         weight, flow = found.to(base.dtype), flow.mT
         state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
