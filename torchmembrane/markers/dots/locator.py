@@ -147,8 +147,8 @@ class DotLocator(nn.Module):
         pixels, shapes = np.asarray(pattern.pixels, float), np.asarray(pattern.shapes, float)
         if len(pixels) < 6 or not (np.isfinite(pixels).all() and np.isfinite(shapes).all()):
             raise MembraneError(
-                f"DotLocator: {len(pixels)} dots, {int(np.isfinite(pixels).all(1).sum())} of them at finite pixels; expected at "
-                "least 6, all with finite pixels and shapes: leave out dots that are not visible in the rest image"
+                f"DotLocator: {len(pixels)} dots, {int(np.isfinite(pixels).all(1).sum())} of them at finite pixels; expected "
+                "at least 6, all with finite pixels and shapes: leave out dots that are not visible in the rest image"
             )
         self.polarity, self.image_size, self.is_exact = polarity, tuple(image_size), False
         tolerance = size_tolerance(shapes, np.asarray(pattern.sizes))
