@@ -66,8 +66,10 @@ def loading(found: dict) -> str:
 
 def exports(found: dict) -> str:
     """Exported models of random sensors against torch, and what they cost."""
+    from bench.accuracy.exports import CLOSE
+
     rows, refused = found["rows"], found["refused"]
-    others = [row for row in rows if not row["same"]]
+    others = [row for row in rows if row["share"] > CLOSE]
     text = (
         f"Of {len(rows) + refused} exports, {refused or 'none'} {'is' if refused < 2 else 'are'} refused. Every status equals "
         f"that of torch in {sum(row['statuses'] for row in rows)} of them. In {len(rows) - len(others)}, the vertices agree "
@@ -94,7 +96,7 @@ def exports_summary(results: dict) -> dict:
 
     done = [row for row in results["rows"] if "error" not in row]
     rows = [
-        {key: row[key] for key in ("number", "same", "seconds", "megabytes")}
+        {key: row[key] for key in ("number", "seconds", "megabytes")}
         | dict(
             statuses=row["statuses_equal"],
             share=row["apart"] / max(row["displacement"], 1.0),
