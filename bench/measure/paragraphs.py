@@ -50,7 +50,7 @@ def sequence(found: dict) -> str:
         return f"{text}."
     off, most = (max(row[key] for row in apart) for key in ("difference", "worst_frame"))
     return (
-        f"{text} in {strokes - len(apart)} strokes. In the others, other dots are found: the surfaces differ by up to "
+        f"{text} in {strokes - len(apart)} strokes. In the rest, other dots are found, and the surfaces differ by up to "
         f"{100 * off:.2g} % of the displacement (rms; {100 * most:.2g} % in the worst frame)."
     )
 
