@@ -123,7 +123,7 @@ def throughput(found: dict) -> Rows:
             {"processes": "worker processes", "ray": "Ray (`--engine ray`)"}[row["engine"]],
             str(row["workers"]),
             f"{row['rate']:.0f}",
-            f"{row['milliseconds']:.0f} ms",
+            f"{row['milliseconds']:.0f} ms" if row["engine"] == "processes" else "",  # Ray's workers are not our children
             f"{1e6 / row['rate'] / 3600:.1f} h",
         ]
         for row in found["rows"]
