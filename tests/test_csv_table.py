@@ -174,7 +174,7 @@ def test_a_cell_that_is_no_one_number_is_named_with_its_line_and_column(kind, ce
         return
     said = refused(kind, tmp_path, "\n".join([*lines[:-1], ",".join(last)]))
     assert f"line {len(lines)}: {names[column]} = " in said
-    assert re.search("expected a (number with a decimal point|finite number)", said)
+    assert re.search("expected a (number such as 12 or 1.5, with a point and not a comma|finite number)", said)
 
 
 @every_reader

@@ -98,7 +98,7 @@ def test_an_exact_locator_tells_the_same_whatever_the_rounding_before_its_fit():
     locator.be_exact()
     exact = [nudged(locator, by) for by in (0.0, 1e-7)]
     apart = [max(float((a - b).abs().max()) for a, b in zip(*pair, strict=True)) for pair in (found, exact)]
-    assert apart[0] > 1e-7 and apart[1] < 1e-12
+    assert apart[1] < 1e-12 < apart[0]
     assert exact[0].pixels.dtype == torch.float64 and float((exact[0].pixels - found[0].pixels).abs().max()) < 0.01
 
 

@@ -151,7 +151,7 @@ def test_init_places_a_second_camera_by_its_rest_image(tmp_path, capsys):
     for given, said in (
         (["left"], "expected the first view's name, and NAME=X,Y,Z"),
         (["left", "right"], "NAME=X,Y,Z of each other one"),
-        (["one", "right=12,1,3"], "expected the first view's image, NAME_one.png"),
+        (["one", "right=12,1,3"], "does not end with '_one', the first view's; expected NAME_one.png"),
     ):
         assert main(["init", str(tmp_path / "no.toml"), *shape, *rest, "--views", *given]) == 2
         assert said in capsys.readouterr().err

@@ -122,7 +122,11 @@ def test_regions_share_one_image(press, found, tmp_path):
         ('name = "left"', 'name = "left"\nside = "outside"', "'inside' of the first view"),
         ("[0.0, 1.0, 0.0, 0.0]", "[0.0, 2.0, 0.0, 0.0]", "orthogonal rows"),
         (", [0.0, 0.0, 0.0, 1.0]]", "]", "4 rows of 4 finite numbers"),
-        ("[markers]", '[markers]\nrest_image = "sensor_rest_left.png"', "as view 'left' has no region: give each"),
+        (
+            "[markers]",
+            '[markers]\nrest_image = "sensor_rest_left.png"',
+            "because view 'left' has no region of a shared image: give each",
+        ),
     ],
 )
 def test_what_is_no_view_is_refused_in_words(press, tmp_path, old, new, said):
