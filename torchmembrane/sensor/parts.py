@@ -6,23 +6,17 @@ Lengths are in the sensor's unit, positions in the camera's frame, and pressures
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..camera.model import Camera
 from ..errors import MembraneError, check_arguments, expect
 from ..files.images import read_image, to_grey
-from ..pose import Pose
 from ..surface import shapes
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
-from .record import Record
 from .suggestions import did_you_mean
-from .working_range import GENERAL, WorkingRange
-
-if TYPE_CHECKING:
-    from .views import View
 
 MOST_PRESTRETCH, MOST_C2_RATIO, MOST_FRICTION = 10.0, 1e3, 10.0
 FRICTION = 0.5
@@ -270,38 +264,6 @@ class Surface:
     def numbers(self) -> dict[str, Any]:
         """Return the values that are stored in the sensor file itself."""
         return {key: value for key, value in self.values.items() if not isinstance(value, np.ndarray)}
-
-
-class SensorParts(NamedTuple):
-    """All parts of a sensor, as read from its file and written to it.
-
-    Attributes:
-        name: any text.
-        length_unit: one of `METRE`.
-        camera: the `Camera`.
-        membrane: the rest surface on the solver grid.
-        material: the `Material`.
-        cavity: the `Cavity`.
-        markers: the `Markers`.
-        surface: the rest surface as the file describes it.
-        tool: the camera's pose in the tool's frame, if it is known.
-        record: serial number and calibration.
-        range: the validated working range.
-        views: all views if there are several, else empty.
-    """
-
-    name: str
-    length_unit: str
-    camera: Camera
-    membrane: Membrane
-    material: Material
-    cavity: Cavity
-    markers: Markers
-    surface: Surface
-    tool: Pose | None = None
-    record: Record = Record()
-    range: WorkingRange = GENERAL
-    views: tuple["View", ...] = ()
 
 
 def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:

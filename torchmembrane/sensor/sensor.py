@@ -20,12 +20,11 @@ from .parts import (
     Cavity,
     Markers,
     Material,
-    SensorParts,
     Surface,
     refuse_other_size,
 )
 from .record import Record
-from .toml import read_sensor, tables_of, write_sensor
+from .toml import SensorParts, read_sensor, tables_of, write_sensor
 from .units import METRE, hectopascal
 from .views import SurfaceInView, View, refuse_views
 from .working_range import GENERAL, WorkingRange

@@ -4,7 +4,7 @@ import io
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,13 +28,13 @@ from .parts import (
     Cavity,
     Markers,
     Material,
-    SensorParts,
     Surface,
     refuse_other_size,
 )
 from .record import Record, read_record
 from .table import Table, toml_lines
 from .units import METRE
+from .views import View
 from .working_range import GENERAL, WorkingRange, range_file
 
 FORMAT = 1
@@ -48,6 +48,38 @@ DOTS_HEADER = ("x", "y", "z", "size")
 HEIGHT, UPWARDS = "height", "0 or more, along the inward normal"
 COORDINATE = Limit(FARTHEST, "a coordinate", "the length unit")
 DOTS = Columns([DOTS_HEADER], "dot", HEIGHT, most=MOST_DOTS)
+
+
+class SensorParts(NamedTuple):
+    """All parts of a sensor, as read from its file and written to it.
+
+    Attributes:
+        name: any text.
+        length_unit: one of `METRE`.
+        camera: the `Camera`.
+        membrane: the rest surface on the solver grid.
+        material: the `Material`.
+        cavity: the `Cavity`.
+        markers: the `Markers`.
+        surface: the rest surface as the file describes it.
+        tool: the camera's pose in the tool's frame, if it is known.
+        record: serial number and calibration.
+        range: the validated working range.
+        views: all views if there are several, else empty.
+    """
+
+    name: str
+    length_unit: str
+    camera: Camera
+    membrane: Membrane
+    material: Material
+    cavity: Cavity
+    markers: Markers
+    surface: Surface
+    tool: Pose | None = None
+    record: Record = Record()
+    range: WorkingRange = GENERAL
+    views: tuple[View, ...] = ()
 
 
 def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
