@@ -231,6 +231,15 @@ RAW = {
         ]
         + [dict(number=2, error="too large")]
     ),
+    "real-bubble": dict(
+        surface=[
+            dict(estimator=name, frames=2, ok=2, contact=1, rms_contact=0.2, none_contact=0.8, none_before=0.08)
+            | dict(deepest=-0.04, away=12.0, rows=[dict(camera_depth=depth) for depth in (5.0, 5.4)])
+            for name in ("the sensor's material", "force balance")
+        ],
+        held=dict(forces=[0.0, 4.5], force=4.5),
+        poke=dict(forces=[4.5], rms=0.35),
+    ),
     "knocked": dict(
         presses=[
             {
@@ -269,6 +278,7 @@ SAID = {
         "2 frames at rest, a contact is reported in none",
     ),
     "exports": ("3 exports, 1 is refused", "(numbers 1)", "1 to 1 %", "50 s of processor", "51 s at most", "3 MB"),
+    "real-bubble": ("1 photographs", "up to 5.4 mm deep", "is 0.20 mm", "be 0.80 mm", "within 4 %", "2 of the 2 photographs"),
     "knocked": ("| 5.0 / 5.0 | 5.0 / 5.0 |", "| 1 of 1 | 0 of 1 |", "| 0.020 / 0.020 |", "| 1, 0 | 1, 0 |", "| 1 | 1 |"),
     "weight": ("3 of 4", "1.05 to 1.05", "5.0 %", "all: 20 forces"),
 }
@@ -277,7 +287,7 @@ SAID = {
 @pytest.mark.parametrize("part", RAW)
 def test_what_a_benchmark_writes_gives_its_table(part):
     """So that no run of hours ends in an error: a part's record is a summary of what its benchmark writes."""
-    table = "crash-recovery" if part == "crash-npz" else part
+    table = {"crash-npz": "crash-recovery", "real-bubble": "bubble-surface"}.get(part, part)
     parts, make = TABLES[table]
     made = make(*[SUMMARIES[part](RAW[part])] * len(parts))
     text = made if isinstance(made, str) else pages.markdown(made)

@@ -22,7 +22,7 @@ from torchmembrane.simulate.simulator import Simulator
 
 
 def false_contacts(number: int, draws: int, frames: int, noise: float) -> dict:
-    """Return the counts of one sensor, and its largest force over tension times size; `noise` is the ratio of signal, dB."""
+    """Return the counts of one sensor, and its largest force over tension times size; `noise`: signal over noise, dB."""
     sensor = random_sensor(number)
     simulator, rng = Simulator(sensor), np.random.default_rng([1, number])
     with torch.no_grad():

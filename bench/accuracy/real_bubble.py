@@ -122,11 +122,13 @@ def surface(folder: Path, paths: dict[int, Path], label: str, held: list[int]) -
     inner = depth_map(torch.from_numpy(sensor.surface.values["vertices"][1:-1, 1:-1].reshape(-1, 3)), camera)
     rest = lattice(*(folder / f"depth_{frame:03d}.png" for frame in REST))
     membrane = np.isfinite(inner) & np.isfinite(rest) & (np.abs(inner - rest) < 3)
+    ours_at_rest = depth_map(sensor.membrane.rest, camera)
     for frame, path in paths.items():
         true = lattice(folder / f"depth_{frame:03d}.png") - rest
         result = reconstructor(reconstructor.read(path))
-        got = depth_map(result.vertices[0], camera) - depth_map(sensor.membrane.rest, camera)
-        errors = frame_errors(got, true, membrane & np.isfinite(true) & (np.abs(true) < 12))
+        errors = frame_errors(
+            depth_map(result.vertices[0], camera) - ours_at_rest, true, membrane & np.isfinite(true) & (np.abs(true) < 12)
+        )
         rows.append(dict(frame=frame, status=int(result.status[0]), **errors))
     contact = [row for row in rows if row["frame"] in CONTACT and row["camera_depth"] > 1]
     before, still = ([row for row in rows if row["frame"] in frames] for frames in (BEFORE, held))

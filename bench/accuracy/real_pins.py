@@ -131,6 +131,7 @@ def followed(finger: Finger, name: str, found: list[dict], rest: np.ndarray) -> 
     statuses, moving = np.array([int(frame["status"]) for frame in found]), finger.moving()
     errors = finger.errors(np.array([frame["markers"] for frame in found])[moving] - rest, np.flatnonzero(moving))
     row = dict(
+        pins=off.shape[1],
         fewest_found=int(np.isfinite(off).sum(1).min()),
         fewest_near=int((off < NEAR).sum(1).min()),
         farthest_px=float(np.nanmax(off)),
@@ -139,7 +140,7 @@ def followed(finger: Finger, name: str, found: list[dict], rest: np.ndarray) -> 
         statuses_moving=counted(statuses[moving].tolist()),
         error=np.nanquantile(errors, (0, 0.5, 1)).tolist(),
     )
-    print(f"  {name}: at least {row['fewest_found']} of {off.shape[1]} pins found and {row['fewest_near']} within {NEAR:g} px;")
+    print(f"  {name}: at least {row['fewest_found']} of {row['pins']} pins found and {row['fewest_near']} within {NEAR:g} px;")
     print(f"    the others are {len(row['astray'])} pins, up to {row['farthest_px']:.2f} px off")
     print(f"    at rest {in_words(row['statuses_at_rest'])}; moving {in_words(row['statuses_moving'])}")
     print("    error over motion: least {:.2f}, median {:.2f}, most {:.2f}".format(*row["error"]))

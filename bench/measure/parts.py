@@ -83,7 +83,7 @@ PARTS = {
     "loading": Part("bench.speed.loading", EXPORT),
     "rim": Part(
         "bench.accuracy.rim",
-        ("torchmembrane/calibrate", "torchmembrane/markers", "torchmembrane/presets", "torchmembrane/simulate"),
+        tuple(f"torchmembrane/{name}" for name in ("calibrate", "camera", "markers", "presets", "simulate")),
     ),
     "scaling": Part("bench.speed.scaling"),
     "simulator": Part("bench.accuracy.simulator", SIMULATOR),

@@ -24,14 +24,15 @@ def tactip(found: dict) -> Rows:
 def finger(found: dict) -> str:
     """Pins found, statuses and errors of the finger with a thick skin."""
     of, alone, tracked = found["finger"], found["finger"]["alone"], found["finger"]["tracked"]
-    fewest = min(alone["fewest_found"], tracked["fewest_found"])
+    found_in, near_in = (min(each[key] for each in (alone, tracked)) for key in ("fewest_found", "fewest_near"))
+    astray, farthest = {*alone["astray"], *tracked["astray"]}, max(each["farthest_px"] for each in (alone, tracked))
     low, _, high = alone["error"]
     others = ", ".join(f"{count} with {name}" for name, count in of["ok_by_file"].items())
     return (
         f"For {of['frames']} of its photographs, the positions of the pins are known from stereo with two mirrors. At least "
-        f"{fewest} of 60 pins are found in each frame, with and without tracking, and at least {alone['fewest_near']} of them "
-        f"lie within 1 px of the stereo positions. The others, always among the same {len(alone['astray'])} pins, are up to "
-        f"{alone['farthest_px']:.1f} px off. Status ok is given to {alone['statuses_at_rest'].get('0', 0)} of the "
+        f"{found_in} of {alone['pins']} pins are found in each frame, with and without tracking, and at least {near_in} of them "
+        f"lie within 1 px of the stereo positions. The others, always among the same {len(astray)} pins, are up to "
+        f"{farthest:.1f} px off. Status ok is given to {alone['statuses_at_rest'].get('0', 0)} of the "
         f"{of['at_rest']} frames in which no pin moves by more than the stereo's noise, and to "
         f"{alone['statuses_moving'].get('0', 0)} of the {of['moving']} others, of which "
         f"{alone['statuses_moving'].get('7', 0)} have status 7. In these, the error of the surface is {low:.1f} to {high:.1f} "

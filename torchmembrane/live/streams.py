@@ -93,8 +93,8 @@ class ModelStream:
     """
 
     def __init__(self, path: Path, sensor: str, threads: int = 1):
-        self._edge, self._path = load_edge(), path
-        edge = self._edge
+        self._edge = edge = load_edge()
+        self._path = path
         try:
             self._session = edge.Session(path, threads)
         except edge.EdgeError as error:
