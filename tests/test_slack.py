@@ -65,7 +65,7 @@ def test_gradients_reach_the_images(slack, small_images):
 
 
 def nudged(locator, by):
-    """What a locator makes of eight images in another runtime, which rounds all that leads to the fit, or follows it, otherwise."""
+    """What a locator makes of eight images in another runtime, which rounds otherwise before the fit and after it."""
     parts = [
         (locator.detect, "forward"),
         (locator.match, "gradient"),

@@ -30,8 +30,8 @@ def finger(found: dict) -> str:
     others = ", ".join(f"{count} with {name}" for name, count in of["ok_by_file"].items())
     return (
         f"For {of['frames']} of its photographs, the positions of the pins are known from stereo with two mirrors. At least "
-        f"{found_in} of {alone['pins']} pins are found in each frame, with and without tracking, and at least {near_in} of them "
-        f"lie within 1 px of the stereo positions. The others, always among the same {len(astray)} pins, are up to "
+        f"{found_in} of {alone['pins']} pins are found in each frame, with and without tracking, and at least {near_in} of "
+        f"them lie within 1 px of the stereo positions. The others, always among the same {len(astray)} pins, are up to "
         f"{farthest:.1f} px off. Status ok is given to {alone['statuses_at_rest'].get('0', 0)} of the "
         f"{of['at_rest']} frames in which no pin moves by more than the stereo's noise, and to "
         f"{alone['statuses_moving'].get('0', 0)} of the {of['moving']} others, of which "
