@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.force_balance import gauss_newton
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import State
 from torchmembrane.estimators.force_balance.kernels import steps as native
@@ -30,7 +31,8 @@ from torchmembrane.surface.shapes import spherical_cap
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
 PACKAGE = Path(native.__file__).parents[3]
 LOADS = 8
-factor_rows, backward = (numba.njit(function.py_func) for function in (native_band.factor_rows, native_band.backward))
+BAND = native_band.factor_rows, native_band.forward, native_band.backward
+factor_rows, forward, backward = (numba.njit(function.py_func) for function in BAND)
 
 
 def estimator(model="neo_hookean", prestretch=1.3, filling="liquid", grid=(11, 9), hole=False):
@@ -98,6 +100,29 @@ def test_a_step_is_that_of_tensor_operations(model, filling, hole):
     balance = estimator(model, filling=filling, hole=hole)
     given = problem(balance, gauge=filling != "open")
     assert_same(taken(balance, *given), expected(balance, *given))
+
+
+@pytest.mark.parametrize("filling", ["liquid", "gas", "open"])
+def test_refinement_makes_a_step_in_single_precision_several_times_more_exact(monkeypatch, filling):
+    """By tensor operations and in machine code; at a state whose weights differ by a thousand."""
+    single, double = estimator(filling=filling).float(), estimator(filling=filling)
+    state, measured = problem(double)
+    given = [
+        cast(*(None if v is None else v.float() for v in values))
+        for cast, values in ((State, state), (type(measured), measured))
+    ]
+    rounded = [
+        cast(*(None if v is None else v.double() for v in values))
+        for cast, values in zip((State, type(measured)), given, strict=True)
+    ]
+    exact = expected(double, *rounded)[0]
+
+    def error(u):
+        return (u.double() - exact).norm().item()
+
+    refined_errors = error(taken(single, *given)[0]), error(expected(single, *given)[0])
+    monkeypatch.setattr(gauss_newton, "refined", lambda solve, apply, b: solve(b))
+    assert max(refined_errors) < error(expected(single, *given)[0]) / 3
 
 
 def set_settings(balance, **changes):
@@ -333,7 +358,10 @@ def test_a_band_is_factored_and_solved_as_the_dense_matrix(unknowns, width, dtyp
     tolerance = 1e3 * np.finfo(dtype).eps
     half = y[:unknowns, :LOADS].astype(float)
     np.testing.assert_allclose(half.T @ half, loads.T @ exact, rtol=0, atol=tolerance * abs(loads.T @ exact).max())
-    first = y[:, 0].copy()
+    first, again = y[:, 0].copy(), np.zeros(size, dtype)
+    again[:unknowns] = loads[:, 0]
+    forward(U, stride, width, inverse, again)
+    np.testing.assert_allclose(again, first, rtol=0, atol=tolerance)
     backward(U, stride, width, inverse, first)
     np.testing.assert_allclose(first[:unknowns], exact[:, 0], rtol=0, atol=tolerance)
 

@@ -8,7 +8,7 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
-from torchmembrane.solve.implicit import differentiable, differentiable_fixed_point
+from torchmembrane.solve.implicit import differentiable, differentiable_fixed_point, refined
 from torchmembrane.solve.inverse_root import LARGEST_CONDITION, LEAF, RIDGE, Steps, by_cholesky, by_products, quintics
 from torchmembrane.solve.kkt import constrained_minimum
 
@@ -38,6 +38,14 @@ def test_steps_after_convergence_and_zero_loads_stay_finite():
     x = conjugate_gradient(lambda y: y @ A, lambda y: y, b, steps=40)
     assert (x[0] == 0).all()
     torch.testing.assert_close(x @ A, b)
+
+
+def test_refinement_squares_the_relative_error_of_a_solution():
+    A, b = spd(6), torch.randn(6, dtype=torch.float64)
+    error = 1e-3 * torch.randn(6, 6, dtype=torch.float64)
+    inverse, exact = torch.linalg.inv(A), torch.linalg.solve(A, b)
+    found = refined(lambda r: (r @ inverse) - (r @ inverse) @ error, lambda y: y @ A, b)
+    torch.testing.assert_close(exact - found, exact @ error @ error, rtol=1e-6, atol=0)
 
 
 def test_gradients_of_a_solution_are_the_dense_solution_s_and_there_are_no_second_ones():

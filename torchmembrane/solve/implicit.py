@@ -22,6 +22,27 @@ UNROLLED_STEPS = 8
 """Number of steps whose gradient a compiled graph takes instead, which cannot differentiate within its backward pass."""
 
 
+def refined(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
+    """Return `x = solve(b)` after one step of iterative refinement, which solves again for the residual `b - A x`.
+
+    In single precision `solve` loses as many digits as the condition of `A` has. The step wins back most of them if `apply`
+    computes the residual more exactly than from the entries of `A`, for example from the factors of `A = B^T B`.
+
+    Reference: Higham 2002, Accuracy and stability of numerical algorithms, chapter 12.
+
+    Args:
+        solve: function that applies an approximation of `A^-1`.
+        apply: function that multiplies by `A`, from `[..., N]` to `[..., N]`.
+        b: right-hand sides, `[..., N]`.
+
+    Example:
+        >>> round(refined(lambda r: 0.49 * r, lambda x: 2 * x, torch.tensor(1.0)).item(), 4)  # 1 / 2
+        0.4998
+    """
+    x = solve(b)
+    return x + solve(b - apply(x))
+
+
 def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
     """Return `x = solve(b)` with the gradients of the exact solution of `A x = b`.
 

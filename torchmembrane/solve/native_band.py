@@ -101,6 +101,22 @@ def factor_rows(U, stride, width, i, inverse, y, count, R):
 
 
 @compiled
+def forward(U, stride, width, inverse, b):
+    """Replace `b [n]` by the solution `y` of `U^T y = b`."""
+    n, lanes = len(inverse), BYTES // U.itemsize
+    for k in range(n):
+        b[k] *= inverse[k]
+        of_row, end = PAD + k * stride, min(k + 1 + width, n)
+        c = k + 1
+        while c + lanes <= end:
+            store(b, c, load(b, c) - load(U, of_row + c) * b[k])
+            c += lanes
+        while c < end:
+            b[c] -= U[of_row + c] * b[k]
+            c += 1
+
+
+@compiled
 def backward(U, stride, width, inverse, y):
     """Replace `y [n]` by the solution `x` of `U x = y`."""
     n = len(inverse)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ...control_flow import chunked, repeat_rows, traced
 from ...machine_code import takes
 from ...mechanics.cavity import CavityLaw
-from ...solve.implicit import differentiable, differentiable_fixed_point
+from ...solve.implicit import differentiable, differentiable_fixed_point, refined
 from ...solve.kkt import border_unknowns
 from ...solve.stencil import inner
 from .kernels.steps import NativeSteps
@@ -217,13 +217,13 @@ class GaussNewton(nn.Module):
         return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn)
 
     def _solved(self, normal: NormalEquations, loads: Tensor) -> Tensor:
-        """Return the solutions `[B, C, 3 N]` of the equations; gradients are those of the exact solution."""
-        equations = self.equations
+        """Return the solutions `[B, C, 3 N]` of the equations, refined once; gradients are those of the exact solution."""
+        system, product = self.equations.system, partial(self.equations.product, normal)
         if torch.compiler.is_compiling():
-            return equations.system.substitute(equations.system.factor(equations.matrix(normal)), loads)
+            return refined(partial(system.substitute, system.factor(self.equations.matrix(normal))), product, loads)
         with torch.no_grad():
-            substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal)))
-        return differentiable(substitute, partial(equations.product, normal), loads)
+            substitute = partial(system.substitute, system.factor(self.equations.matrix(normal)))
+        return differentiable(partial(refined, substitute, product), product, loads)
 
     def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
         """Return the coefficients `[B, 3]` of the three loads' solutions in the negative step: the multiplier of the volume

@@ -119,7 +119,8 @@ class Workspace(NamedTuple):
     y: Any
     """`[3 N x COLUMNS]`, the loads `b`, and then `U^-T b`."""
     solved: Any
-    """`[3 N]`, the solution for a sum of the loads."""
+    """`[3 N]`, the solution for a sum of the loads; `move [3 N]`, the negative step."""
+    move: Any
     ridges: Any
     """`band.RIDGES`: a loop over an array is compiled once, over a tuple once for each of its numbers."""
     columns: Any
@@ -138,7 +139,7 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, P), x=(3, P), cells=(CELLS, P), W=(3, 3, P))
     shapes |= dict(weighted=(3, 21, P), of_loads=(3, 2, P))
     shapes |= dict(sums=(90, P), normal=(N, 3), fields=(5, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
-    shapes |= dict(marker_weights=(markers,), inverse=(size,), scale=(size,), solved=(size,), loads=(LOADS, size))
+    shapes |= dict(marker_weights=(markers,), inverse=(size,), scale=(size,), solved=(size,), move=(size,), loads=(LOADS, size))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
     arrays |= dict(U=matrix(size, stride, dtype), y=aligned(size * COLUMNS, dtype), ridges=np.array(RIDGES, dtype))
     return Workspace(columns=_columns(m - 2, n - 2), width=width, stride=stride, **arrays)
@@ -214,7 +215,7 @@ def weight_of_shear(k, push2):
 def load_forces(c, work):
     """Add the forces to the loads as `BalanceEquations.loads` does; return `f W v` and `v W v`."""
     m, n = c.surface.free.shape
-    loads, of_loads, fWv, vWv = work.loads, work.of_loads, 0.0, 0.0
+    loads, of_loads, vWv = work.loads, work.of_loads, 0.0
     loads[:], of_loads[:] = 0, 0
     for i in range(1, m - 1):
         for j in range(1, n - 1):
@@ -222,29 +223,51 @@ def load_forces(c, work):
                 k, at = (i - 1) * (n - 2) + j - 1, i * n + j
                 for a in range(3):
                     for b in range(3):
-                        of_loads[a, 0, at] += work.W[a, b, at] * work.force[i, j, b]
                         of_loads[a, 1, at] -= work.W[a, b, at] * work.volume[i, j, b]
-                    fWv += of_loads[a, 0, at] * work.volume[i, j, a]
                     vWv -= of_loads[a, 1, at] * work.volume[i, j, a]
                     loads[VOLUME, 3 * k + a] = work.volume[i, j, a]
-    A, sums, P = work.A, work.sums, work.A.shape[2]
+    fWv = load_weighted_forces(c, work)
+    for k in range((m - 2) * (n - 2)):
+        for d in range(3):
+            loads[FLUID, 3 * k + d] = work.sums[3 + d, (k // (n - 2) + 1) * n + k % (n - 2) + 1]
+    return fWv, vWv
+
+
+@compiled
+def load_weighted_forces(c, work):
+    """Write `A^T W f` of the forces to their load; return `f W v`."""
+    (m, n), of_loads, fWv = c.surface.free.shape, work.of_loads, 0.0
+    for k in range((m - 2) * (n - 2)):
+        i, j = k // (n - 2) + 1, k % (n - 2) + 1
+        at = i * n + j
+        for a in range(3):
+            of_loads[a, 0, at] = 0
+            for b in range(3 if c.surface.free[i, j] else 0):
+                of_loads[a, 0, at] += work.W[a, b, at] * work.force[i, j, b]
+            fWv += of_loads[a, 0, at] * work.volume[i, j, a]
+    stiffness_change(work, m, n)
+    for k in range((m - 2) * (n - 2)):
+        for d in range(3):
+            work.loads[FORCES, 3 * k + d] = work.sums[d, (k // (n - 2) + 1) * n + k % (n - 2) + 1]
+    return fWv
+
+
+@compiled
+def stiffness_change(work, m, n):
+    """Write the products of the symmetric stiffness `A` with both fields `of_loads` to the first six rows of `sums`."""
+    A, sums, of_loads, P = work.A, work.sums, work.of_loads, work.A.shape[2]
     for k in range(n + 1, m * n - n - 1, BYTES // A.itemsize):
         for d in range(3):
-            of_forces = of_fluid = load(A, k) * 0.0
+            of_first = of_second = load(A, k) * 0.0
             for s in range(7):
                 at = k - STENCIL[s][0] * n - STENCIL[s][1]
                 a0, a1, a2 = _three(A, (3 * s + d) * P + at, 21 * P)
                 b0, b1, b2 = _three(of_loads, at, 2 * P)
                 c0, c1, c2 = _three(of_loads, P + at, 2 * P)
-                of_forces = of_forces + (a0 * b0 + a1 * b1 + a2 * b2)
-                of_fluid = of_fluid + (a0 * c0 + a1 * c1 + a2 * c2)
-            store(sums, d * P + k, of_forces)
-            store(sums, (3 + d) * P + k, of_fluid)
-    for k in range((m - 2) * (n - 2)):
-        at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
-        for d in range(3):
-            loads[FORCES, 3 * k + d], loads[FLUID, 3 * k + d] = sums[d, at], sums[3 + d, at]
-    return fWv, vWv
+                of_first = of_first + (a0 * b0 + a1 * b1 + a2 * b2)
+                of_second = of_second + (a0 * c0 + a1 * c1 + a2 * c2)
+            store(sums, d * P + k, of_first)
+            store(sums, (3 + d) * P + k, of_second)
 
 
 @compiled

@@ -9,13 +9,14 @@ import numpy as np
 from ....machine_code import compiled
 from ....mechanics.cavity import gas_law_step
 from ....mechanics.native_membrane import linearise
-from ....solve.native_band import COLUMNS, ROWS, backward, factor_rows, subtract_products
+from ....solve.native_band import COLUMNS, ROWS, backward, factor_rows, forward, subtract_products
 from ....solve.symmetric_2x2 import symmetric_solution
 from ....vectors import BYTES
 from ..camera_motion import camera_stiffness
 from ..schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step, share_of_next
-from .equations import CAMERA, FLUID, FORCES, VOLUME, WANTED, load_forces, scale_rows, sum_blocks, weigh, write_vertices
-from .markers import load_markers
+from .equations import CAMERA, FLUID, FORCES, VOLUME, WANTED, load_forces, load_weighted_forces, scale_rows, stiffness_change
+from .equations import sum_blocks, weigh, write_vertices
+from .markers import load_markers, load_markers_after
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
 ratio_of_tau, scale_of_outliers, scaled = compiled(falling), compiled(outlier_scale), compiled(scaled_step)
@@ -57,7 +58,11 @@ def _scaled_step(c, u, before):
 
 @compiled
 def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, share):
-    """Take a share of one step in place: `u [m, n, 3]`, `pressure [1]` and `moved [4]` are overwritten."""
+    """Take a share of one step in place: `u [m, n, 3]`, `pressure [1]` and `moved [4]` are overwritten.
+
+    The linear system is solved twice: first as it stands, and then, with the same factor, from where the first solution leaves
+    the linear equations. This is iterative refinement: the residual comes from the factors of the matrix (`stiffness_change`).
+    """
     (m, n), k = c.surface.free.shape, c.numbers
     outlier = scale_of_outliers(k.outlier, tau / k.last_tau)
     rise = linearise(c.surface, u, pressure, work.x, work.cells, work.force, work.A, work.volume) - c.numbers.rest_volume
@@ -65,25 +70,57 @@ def step(c, work, u, pressure, moved, seen, noise_level, gauge, tau, share):
     weigh(c, work, noise_level, tau, np.bool_(False))
     fWv, vWv = load_forces(c, work)
     load_markers(c, work, u, moved, seen, outlier, own, slope)
+    stiffness, (target, compliance) = stiffness_at(k, moved, tau), cavity_condition(k, rise, pressure[0])
+    for a in range(4):
+        own[a, a] += stiffness
+        slope[a] += stiffness * moved[a]
     sum_blocks(c, work)
     products = factored(c, work, 0.0, np.intp(WANTED))
-    following = _camera_eliminated(c.numbers, products, own, slope, moved, tau)
-    multiplier, one, change = _shares(c.numbers, products, rise, pressure[0], fWv, vWv, gauge)
-    shares, turn = np.zeros(WANTED, u.dtype), np.empty_like(moved)
-    shares[VOLUME], shares[FORCES], shares[FLUID] = multiplier, one, change
-    for a in range(4):
-        turn[a] = multiplier * following[a, 0] + one * following[a, 1] + change * following[a, 2]
-        shares[CAMERA + a] = turn[a]
-    substituted(work, shares)
-    move = work.solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
-    share *= _share(c, u, move)
+    change, turn, shares, move = 0.0, np.zeros_like(moved), np.zeros(WANTED, u.dtype), work.move
+    move[:] = 0
+    for refined in range(2):
+        if refined:
+            fWv = _remaining_forces(c, work, change)
+            slope[:] = 0
+            load_markers_after(c, work, u, moved + turn, seen, slope)
+            for a in range(4):
+                slope[a] += stiffness * (moved[a] + turn[a])
+            target -= compliance * change
+            for i in range(len(work.solved)):
+                target += work.loads[VOLUME, i] * work.solved[i]
+            products = resolved(work)
+        of_fluid = fWv - gauge[1] * (pressure[0] + change - k.rest_pressure - gauge[0])
+        _share_out(k, products, own, slope, target, compliance, of_fluid, vWv + gauge[1], shares)
+        substituted(work, shares)
+        change += shares[FLUID]
+        for a in range(4):
+            turn[a] += shares[CAMERA + a]
+        for i in range(len(work.solved)):
+            move[i] += work.solved[i]
+    share *= _share(c, u, move[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3)))
     for i in range(m - 2):
         for j in range(n - 2):
             for a in range(3):
-                u[i + 1, j + 1, a] -= share * move[i, j, a]
+                u[i + 1, j + 1, a] -= share * move[3 * (i * (n - 2) + j) + a]
     pressure[0] += share * change
     for a in range(4):
         moved[a] += share * turn[a]
+
+
+@compiled
+def _remaining_forces(c, work, rise):
+    """Replace the forces by those after a step, to first order: the vertices moved by `-solved`, and the pressure by `rise`;
+    write their load, and return `f W v`."""
+    m, n = c.surface.free.shape
+    for k in range((m - 2) * (n - 2)):
+        for a in range(3):
+            work.of_loads[a, 0, (k // (n - 2) + 1) * n + k % (n - 2) + 1] = work.solved[3 * k + a]
+    stiffness_change(work, m, n)
+    for k in range((m - 2) * (n - 2)):
+        i, j = k // (n - 2) + 1, k % (n - 2) + 1
+        for a in range(3 if c.surface.free[i, j] else 0):
+            work.force[i, j, a] -= work.sums[a, i * n + j] + rise * work.volume[i, j, a]
+    return load_weighted_forces(c, work)
 
 
 @compiled
@@ -102,6 +139,17 @@ def factored(c, work, damping, used):
     if not found:
         work.y[:] = np.nan
     return _products(work.y, used)
+
+
+@compiled
+def resolved(work):
+    """Solve `U^T y = b` again for the load of the forces alone, and return the products as `factored` does."""
+    for i in range(len(work.scale)):
+        work.solved[i] = work.loads[FORCES, i] * work.scale[i]
+    forward(work.U, work.stride, work.width, work.inverse, work.solved)
+    for i in range(len(work.scale)):
+        work.y[i * COLUMNS + FORCES] = work.solved[i]
+    return _products(work.y, np.intp(WANTED))
 
 
 @compiled
@@ -165,17 +213,16 @@ def eliminated(system):
 
 
 @compiled
-def _camera_eliminated(k, products, own, slope, moved, tau):
-    """Apply `CameraMotion.held` and `eliminated`: return how the camera follows each load, `[4, 3]`, and include the
-    camera in the products of the loads."""
-    stiffness, system = stiffness_at(k, moved, tau), np.empty((4, 7))
+def _camera_eliminated(products, own, slope):
+    """Apply `CameraMotion.eliminated`: return how the camera follows each load, `[4, 3]`, and include the camera in the
+    products of the loads."""
+    system = np.empty((4, 7))
     for a in range(4):
         for b in range(4):
             system[a, b] = own[a, b] - products[CAMERA + a, CAMERA + b]
         for b in range(3):
             system[a, 4 + b] = products[CAMERA + a, b]
-        system[a, a] += stiffness
-        system[a, 4 + FORCES] -= slope[a] + stiffness * moved[a]
+        system[a, 4 + FORCES] -= slope[a]
     eliminated(system)
     for a in range(3):
         for b in range(3):
@@ -185,15 +232,18 @@ def _camera_eliminated(k, products, own, slope, moved, tau):
 
 
 @compiled
-def _shares(k, products, rise, pressure, fWv, vWv, gauge):
-    """Apply `GaussNewton._shares`: return the shares of the volume's multiplier, forces and pressure change in a step."""
-    if k.is_open:
-        return 0.0, 1.0, 0.0
-    fWv, vWv = fWv - gauge[1] * (pressure - k.rest_pressure - gauge[0]), vWv + gauge[1]
-    target, compliance = cavity_condition(k, rise, pressure)
-    loads = fWv + products[FLUID, FORCES], target + products[VOLUME, FORCES]
-    multiplier, change = border_unknowns(products, vWv, compliance, *loads)
-    return multiplier, 1.0, change
+def _share_out(k, products, own, slope, target, compliance, of_fluid, vWv, shares):
+    """Write the shares `[WANTED]` of the loads in a negative step, as `GaussNewton._shares` and `CameraMotion.eliminated` do:
+    of the volume it is the multiplier, of the fluid the increase of the pressure, and of the camera its motion."""
+    following = _camera_eliminated(products, own, slope)
+    shares[:] = 0
+    shares[FORCES] = 1
+    if not k.is_open:
+        loads = of_fluid + products[FLUID, FORCES], target + products[VOLUME, FORCES]
+        shares[VOLUME], shares[FLUID] = border_unknowns(products, vWv, compliance, *loads)
+    for a in range(4):
+        for b in range(3):
+            shares[CAMERA + a] += following[a, b] * shares[b]
 
 
 @compiled

@@ -41,6 +41,28 @@ def load_markers(c, work, u, moved, seen, outlier, own, slope):
 
 
 @compiled
+def load_markers_after(c, work, u, moved, seen, slope):
+    """Add to the load of the forces and to `slope [4]` what the markers contribute after a step, to first order: the vertices
+    have moved by `-solved` from `u`; `moved [4]` is the camera's motion after the step."""
+    (_, _, weight, motion), (corners, pulls) = seen, c.corners
+    place, jacobian, angle = np.zeros(3), np.zeros((2, 3)), np.zeros(2)
+    for d in range(len(weight)):
+        place_of(c, u, d, place)
+        turned(seen, d, place, moved, jacobian, angle)
+        for s in range(3):
+            for a in range(3):
+                move = -pulls[d, s] * work.solved[3 * corners[d, s] + a]
+                angle[0] += jacobian[0, a] * move
+                angle[1] += jacobian[1, a] * move
+        for s in range(3):
+            for a in range(3):
+                pull = work.jacobians[d, 0, a] * angle[0] + work.jacobians[d, 1, a] * angle[1]
+                work.loads[FORCES, 3 * corners[d, s] + a] += pulls[d, s] * pull
+        for a in range(4):
+            slope[a] += work.marker_weights[d] * (motion[0, a, d] * angle[0] + motion[1, a, d] * angle[1])
+
+
+@compiled
 def turned(seen, d, place, moved, jacobian, angle):
     """Apply `MarkerResiduals._seen`: return the angles of marker d at `place`, their derivatives in it, and the sum of their
     squares; `place` is overwritten with the vector from the ray's origin."""
