@@ -137,19 +137,38 @@ def _outlined(c, d, rows, offset, growth, before, window, fields):
 
 
 @compiled
+def _tile(a, b, p, q, r, s, gram):
+    """Write the products of two rows with four others: the eight sums are in registers, and a row is read once for several."""
+    ap, aq, ar, at = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    bp, bq, br, bt = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    for k in range(len(a)):
+        ap += a[k] * p[k]
+        aq += a[k] * q[k]
+        ar += a[k] * r[k]
+        at += a[k] * s[k]
+        bp += b[k] * p[k]
+        bq += b[k] * q[k]
+        br += b[k] * r[k]
+        bt += b[k] * s[k]
+    gram[0, 0], gram[0, 1], gram[0, 2], gram[0, 3] = ap, aq, ar, at
+    gram[1, 0], gram[1, 1], gram[1, 2], gram[1, 3] = bp, bq, br, bt
+
+
+@compiled
 def _products(fields, each, gram):
     """`EllipseFit._gram`: the products `[8, 8]` of the fields, which are brought into rows, `each [8, P']`."""
     for i in range(FIELDS):
         row = each[i]
         for block in range(len(row) // LANES):
             first, at = block * LANES, (block * FIELDS + i) * LANES
-            row[first : first + LANES] = fields[at : at + LANES]
+            for k in range(LANES):
+                row[first + k] = fields[at + k]
+    for i in range(0, FIELDS, 2):
+        for j in range(0, i + 2, 4):
+            _tile(each[i], each[i + 1], each[j], each[j + 1], each[j + 2], each[j + 3], gram[i : i + 2, j : j + 4])
     for i in range(FIELDS):
-        for j in range(i + 1):
-            a, b, total = each[i], each[j], np.float32(0)
-            for k in range(len(a)):
-                total += a[k] * b[k]
-            gram[i, j] = gram[j, i] = total
+        for j in range(i):
+            gram[j, i] = gram[i, j]
 
 
 @compiled
