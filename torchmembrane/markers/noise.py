@@ -3,6 +3,9 @@
 import torch
 from torch import Tensor
 
+from .native_frames import found_by, is_native
+from .native_image import noises
+
 STRIDE = 7  # px between the sampled positions, which visit every phase of 8-px blocks
 GAIN = 6  # of the second difference in u of that in v, in noise (Immerkaer 1996)
 EXPOSED = (0.03, 0.97)  # range of grey in which noise is not clipped
@@ -24,6 +27,8 @@ def pixel_noise(images: Tensor) -> Tensor:
         >>> round(pixel_noise(0.5 + 0.02 * noise).item(), 3)
         0.02
     """
+    if is_native(images):
+        return found_by(noises, (STRIDE, *EXPOSED, NO_LIMIT, OUTLIER_FACTOR, ROUNDS, GAIN * BIAS), (images[:, 0],))
     size = _second_difference(_second_difference(images, -2), -1).abs()
     middle = images[..., 1:-1:STRIDE, 1:-1:STRIDE]
     size = torch.where((middle > EXPOSED[0]) & (middle < EXPOSED[1]), size, 2 * NO_LIMIT).flatten(1)[:, None]

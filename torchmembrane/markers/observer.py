@@ -13,6 +13,8 @@ from ..files.tensors import tensor_of
 from ..machine_code import is_used, using
 from ..results.status import Status
 from .locator import Locator, isotropic
+from .native_frames import found_by, is_native
+from .native_image import statuses
 from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen
 
@@ -197,6 +199,10 @@ class MarkerObserver(nn.Module):
     @traced
     def check(self, images: Tensor) -> Tensor:
         """Return the status `[B]` of images."""
+        if is_native(images):
+            limits = LEAST_CONTRAST, SATURATED_SHARE, SATURATION_STRIDE
+            codes = Status.BLANK.value, Status.BAD_VALUES.value
+            return found_by(statuses, (*limits, *codes), (images[:, 0],)).to(torch.int64)
         flat, sparse = images.flatten(1), images[..., ::SATURATION_STRIDE, ::SATURATION_STRIDE]
         mean, low, high = flat.mean(1), flat.amin(1), flat.amax(1)
         bad = ~((mean < torch.inf) & (low > -1e-3) & (high < 1.001))  # one value that is not finite makes the mean so

@@ -7,7 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ..native_frames import Constants, found_by, is_native
 from .bands import BandProduct, SeparableMap, blur_rows, linear_rows, pair_means
+from .native_blobs import peak_constants, peaks, responses, scale_constants
 from .pyramid import LEVELS
 from .scales import PREDICTION, SHADE
 
@@ -33,14 +35,20 @@ class HessianScale(nn.Module):
         self.blur_v, self.blur_u = (
             BandProduct(sigma * blur_rows(side // stride, sigma, on)) for on, side in zip(rows, size, strict=True)
         )
-        self.spread = None
+        self.spread, self.native = None, Constants(scale_constants)
         if stride > cell:
             at = [(_cells(span, cell) - (stride - 1) / 2) / stride - span[0] // stride for span in box]
+            self.cells = [x.clip(0, len(on) - 3) for on, x in zip(rows, at, strict=True)]
             self.spread = SeparableMap(*(linear_rows(len(on) - 2, x) for on, x in zip(rows, at, strict=True)))
 
     def forward(self, levels: list[Tensor]) -> Tensor:
         """Return `sigma^4 det Hessian` of the cells where the image is a dark maximum, else 0, `[B, 1, rows, columns]`."""
-        blurred = self.blur_u(self.blur_v(levels[self.level]))
+        level = levels[self.level]
+        if is_native(level, self.blur_v.blocks):
+            fine = max(1, self.cell // 2**self.level), max(1, 2**self.level // self.cell)
+            shape = (side // fine[0] * fine[1] for side in (self.rows, self.columns))
+            return found_by(responses, self.native.of(self, self.blur_v.blocks), (level[:, 0],), *shape)[:, None]
+        blurred = self.blur_u(self.blur_v(level))
         above, middle, below = (blurred[..., n : n + self.rows, :] for n in range(3))
         left, centre, right = (slice(n, n + self.columns) for n in range(3))
         uu = (middle[..., right] + middle[..., left]).sub(middle[..., centre], alpha=2)
@@ -97,6 +105,7 @@ class BlobDetector(nn.Module):
             HessianScale(int(k), float(r / np.sqrt(2) / 2**k), self.cell, self.box, (height, width))
             for k, r in zip(levels, radii, strict=True)
         )
+        self.native = Constants(peak_constants)
         self.background = SeparableMap(
             *(_background_rows(_cells(span, self.cell), side) for span, side in zip(self.box, (height, width), strict=True))
         )
@@ -105,6 +114,10 @@ class BlobDetector(nn.Module):
         """Locate blobs in `levels` of `mean_pyramid` with dark dots: centres `[B, K, 2]` px, log radius, strength `[B, K]`."""
         background = self.background(levels[-1]) + SHADE
         scales = [scale(levels) for scale in self.scales]
+        if is_native(*scales, background, self.inside):
+            given = torch.cat(scales, 1), background[:, 0]
+            found = found_by(peaks, self.native.of(self, self.inside), given, self.count, 4)
+            return found[..., :2], found[..., 2], found[..., 3]
         peak = reduce(torch.maximum, scales) / background.square() * self.inside
         strength, cell = (peak * (peak == highest_around(peak, self.reach))).flatten(1).topk(self.count)
         strength = strength.clamp_min(1e-20).sqrt()

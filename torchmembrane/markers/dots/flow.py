@@ -4,8 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..native_frames import found_by, is_native
 from ..spacing import faded, spacing
-from .native_flow import flows, found_by, gradients, is_native
+from .native_flow import flows, gradients
 from .scales import RIDGE
 
 SUPPORT = 0.5  # smallest number of confident nodes, weighted by distance, for a prediction
@@ -52,7 +53,7 @@ class FlowAverages(nn.Module):
         """Return the gradient `[B, 2, 2, D]` of the least-squares affine flow; it tends to `prior` where the neighbours do not
         determine it."""
         if is_native(weight, flow, prior, self.h):
-            return found_by(gradients, self._constants(), (weight, flow, prior), 2, 2, len(self.h))
+            return found_by(gradients, self.constants(), (weight, flow, prior), 2, 2, len(self.h))
         weight = weight[:, None]
         rows = torch.cat([weight, weight * flow], 1)
         sums = (rows @ self.moments).unflatten(-1, (7, -1))  # [B, 3, 7, D]
@@ -75,7 +76,7 @@ class FlowAverages(nn.Module):
             Flow `[B, 2, D]` and support `[B, D]`: the sum of the confident nodes around, weighted by distance.
         """
         if is_native(weight, flow, gradient, self.h):
-            found = found_by(flows, self._constants(), (weight, flow, gradient), 3, len(self.h))
+            found = found_by(flows, self.constants(), (weight, flow, gradient), 3, len(self.h))
             return found[:, :2], found[:, 2]
         weight = weight[:, None]
         rows = torch.cat([weight, weight * torch.cat([flow, gradient.flatten(1, 2)], 1)], 1)
@@ -87,5 +88,7 @@ class FlowAverages(nn.Module):
         total = sums[:, 1:3, 0].addcmul(self.h, theirs + mine, value=-0.5)
         return total / (support + 1e-3)[:, None], support
 
-    def _constants(self) -> tuple[Tensor, ...]:
-        return self.moments, self.first_moments, self.still, self.raised, self.pull, self.h
+    def constants(self) -> tuple[np.ndarray, ...]:
+        """Return the buffers, as machine code takes them."""
+        buffers = self.moments, self.first_moments, self.still, self.raised, self.pull, self.h
+        return tuple(buffer.numpy() for buffer in buffers)

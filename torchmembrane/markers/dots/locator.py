@@ -1,5 +1,7 @@
 """Location of dots in a batch of frames: blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
 
+from functools import partial
+
 import numpy as np
 import torch
 from scipy import ndimage
@@ -9,14 +11,16 @@ from torch import Tensor, nn
 from ...control_flow import traced
 from ...errors import MembraneError
 from ..locator import LocatedMarkers
+from ..native_frames import KEPT_STEPS, Constants, found_by, is_native
 from ..noise import pixel_noise
 from ..spacing import partly_in_view, spacing
 from .detect import BlobDetector
 from .ellipse import draw_dots, size_tolerance
 from .fit import EllipseFit, FittedDots
 from .match import DotMatcher
+from .native_blobs import validities
 from .native_fit import kept_fits
-from .native_flow import KEPT_STEPS
+from .native_verdict import constants, outlines, verdicts
 from .pattern import DotPattern
 from .probability import LEAST, alone, among_neighbours, contrast_evidence, whole_evidence
 from .pyramid import mean_pyramid
@@ -64,16 +68,16 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     return torch.as_tensor(inside, dtype=torch.float64)[None, None]
 
 
-def is_inside(pixels: Tensor, image: Tensor) -> Tensor:
-    """Return which of `pixels [..., 2]` lie in an image `[..., height, width]`, bool.
+def is_inside(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """Return which of `pixels [..., 2]` lie in an image of this width and height, bool.
 
     A dot that its neighbours expect outside the image is not visible; a fit at the border in its place is something else.
 
     Example:
-        >>> is_inside(torch.tensor([[0.0, 0.0], [3.0, 1.0], [3.0, 2.0], [-1.0, 0.0]]), torch.zeros(2, 4)).tolist()
+        >>> is_inside(torch.tensor([[0.0, 0.0], [3.0, 1.0], [3.0, 2.0], [-1.0, 0.0]]), (4, 2)).tolist()
         [True, True, False, False]
     """
-    (u, v), (height, width) = pixels.unbind(-1), image.shape[-2:]
+    (u, v), (width, height) = pixels.unbind(-1), image_size
     return (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
 
 
@@ -162,6 +166,7 @@ class DotLocator(nn.Module):
         own = cKDTree(blobs).query(pixels)[1]
         self.match = DotMatcher(pixels, log_radius[own], tolerance, partly_in_view(pixels, shapes, image_size))
         self.seams = Seams(pixels, log_radius[own], tolerance)
+        self.constants = Constants(partial(constants, confidence=CONFIDENCE, largest=LARGEST_STRAIN))
         self.register_buffer("strength", torch.as_tensor(strength[own]))
         self.register_buffer("rest", torch.as_tensor(pixels))
         self.register_buffer("shapes", torch.as_tensor(shapes))
@@ -197,12 +202,18 @@ class DotLocator(nn.Module):
         image = 1 - image if self.polarity == "light" else image
         levels = mean_pyramid(short(image) if self.is_exact else image)
         blobs, log_radius, strength = self.detect(levels)
-        relative = strength / self.strength[self.match.nearest_dots(blobs)]
-        level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True).clamp_min(LEAST)
-        valid = torch.sigmoid(contrast_evidence(relative / level, FAINT))
+        valid = self.validity(blobs, strength)
         level_0, level_1, level_2 = levels
         start = self._alike(blobs, BLOB), self._alike(log_radius, SHARE), self._alike(valid, SHARE)
         return level_0, level_1, level_2, *start
+
+    def validity(self, blobs: Tensor, strength: Tensor) -> Tensor:
+        """Return the probability `[B, K]` that each of the blobs is a dot, from their strength relative to that at rest."""
+        if is_native(blobs, strength, self.strength):
+            return found_by(validities, (self.rest.numpy(), self.strength.numpy()), (blobs, strength), blobs.shape[1])
+        relative = strength / self.strength[self.match.nearest_dots(blobs)]
+        level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True).clamp_min(LEAST)
+        return torch.sigmoid(contrast_evidence(relative / level, FAINT))
 
     @traced
     def end(
@@ -218,21 +229,45 @@ class DotLocator(nn.Module):
         strain: Tensor,
     ) -> LocatedMarkers:
         """Return the dots, fitted around the positions from the matcher."""
-        levels, rest, shapes = [level_0, level_1, level_2], self.rest, self.shapes
-        gradient = self._alike(self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), SHARE)
-        shape = shapes + gradient.clamp(-LARGEST_STRAIN, LARGEST_STRAIN).to(shapes) @ shapes
         noise = self._alike(pixel_noise(level_0.detach()), NOISE)
-        fitted = self.fit(levels, place, shape, noise, STEPS)
+        fitted = self.fit([level_0, level_1, level_2], place, self.outlines(certainty, place, strain), noise, STEPS)
+        size = level_0.shape[-1], level_0.shape[-2]
+        pixels, confidence = self.judged(fitted, strain, blobs, log_radius, valid, size)
+        return LocatedMarkers(pixels, confidence, fitted.covariance)
+
+    def outlines(self, certainty: Tensor, place: Tensor, strain: Tensor) -> Tensor:
+        """Return the outlines `[B, D, 2, 2]` from which the fits start: those at rest under the gradient of the flow."""
+        rest, shapes = self.rest, self.shapes
+        if not self.is_exact and is_native(certainty, place, strain, shapes):
+            given = certainty, place, strain.movedim(1, -1)
+            return found_by(outlines, self.constants.of(self, rest), given, len(rest), 2, 2)
+        gradient = self._alike(self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), SHARE)
+        return shapes + gradient.clamp(-LARGEST_STRAIN, LARGEST_STRAIN).to(shapes) @ shapes
+
+    def judged(
+        self,
+        fitted: FittedDots,
+        strain: Tensor,
+        blobs: Tensor,
+        log_radius: Tensor,
+        valid: Tensor,
+        image_size: tuple[int, int],
+    ) -> tuple[Tensor, Tensor]:
+        """Return the pixels `[B, D, 2]` of fitted dots, where they are found, and the confidence `[B, D]` in them."""
+        rest, scene = self.rest, (blobs, log_radius, valid)
+        if not self.is_exact and is_native(*fitted, strain, *scene, rest):
+            given = fitted.centre, fitted.explained, fitted.contrast, fitted.misfit, strain.movedim(1, -1), *scene
+            found = found_by(verdicts, (self.constants.of(self, rest), image_size), given, 3, len(rest))
+            return found[:, 1:].mT, found[:, 0]
         dots = FittedDots(*(value.to(rest) for value in fitted))
         by_itself = alone(dots)
         found, error = self.match.neighbour_steps(dots.centre.mT, by_itself, strain.movedim(1, -1))
-        whole = whole_evidence(self.seams(dots.centre, by_itself, error, blobs, log_radius, valid))
+        whole = whole_evidence(self.seams(dots.centre, by_itself, error, *scene))
         share = (by_itself @ self.match.seen.to(by_itself) / self.match.seen.sum())[:, None]
         confidence = rounded(among_neighbours(dots, share * found, error, whole), CONFIDENCE)
         flow, _, _ = self.match.predict(confidence, dots.centre - rest, strain)
-        confidence = confidence * is_inside(rest + flow, level_0).to(confidence)
-        pixels = torch.where(confidence[..., None] > 0.5, fitted.centre, rest + flow)
-        return LocatedMarkers(pixels, confidence, fitted.covariance)
+        confidence = confidence * is_inside(rest + flow, image_size).to(confidence)
+        return torch.where(confidence[..., None] > 0.5, fitted.centre, rest + flow), confidence
 
     def _alike(self, value: Tensor, step: float) -> Tensor:
         """Return the value, or its nearest multiple of a step if every runtime must compute the same."""

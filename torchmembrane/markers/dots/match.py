@@ -1,6 +1,7 @@
 """Matching: assigns the blobs of a frame to dots, assuming a smooth flow."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,12 +9,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...control_flow import cond, fori_loop, traced, where_rows
+from ..native_frames import found_by, is_native
 from ..spacing import spacing
 from .agreement import NeighbourAgreement
 from .alignment import Alignment
 from .deformation import LocalDeformation
 from .flow import SUPPORT, FlowAverages
-from .native_flow import choices, found_by, is_native
+from .native_flow import choices
+from .native_match import bases, followed, sure_states
 from .probability import LEAST, own_evidence
 from .scales import FAR, LOST, PREDICTION, STEPS
 from .steps import NeighbourSteps
@@ -73,6 +76,14 @@ class DotMatcher(nn.Module):
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
         self.register_buffer("numbers", torch.tensor([SUPPORT, LOST, FAR], dtype=torch.float64))
 
+    def chooser(self) -> tuple[np.ndarray, ...]:
+        """Return the buffers of `choose`, as machine code takes them."""
+        return self.pixels.numpy(), self.stiffness.numpy(), self.numbers.numpy()
+
+    def following(self) -> tuple[Any, ...]:
+        """Return the buffers of `follow` and `sure`, as machine code takes them."""
+        return self.averages.constants(), self.chooser(), self.seen.numpy(), self.origin.numpy(), FOUND
+
     def nearest_dots(self, blobs: Tensor) -> Tensor:
         """Return the dot at rest that is nearest to each of `blobs [B, K, 2]`, `[B, K]`."""
         return F.linear(blobs - self.origin, -2 * self.pixels, self.square).argmin(-1)
@@ -102,7 +113,7 @@ class DotMatcher(nn.Module):
         """
         if is_native(predicted, support, blobs, base, self.pixels):
             given = predicted, support, blobs, base
-            taken = found_by(choices, (self.pixels, self.stiffness, self.numbers), given, 7, len(self.pixels))
+            taken = found_by(choices, self.chooser(), given, 7, len(self.pixels))
             return taken[:, 0], taken[:, 1:3], taken[:, 3:].unflatten(1, (2, 2))
         expected = self.pixels.mT + predicted
         alone = (expected * expected).sum(1) * self.stiffness + FAR * (support < SUPPORT).to(support.dtype)
@@ -211,6 +222,9 @@ class DotMatcher(nn.Module):
             Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]`, as `search` does; and `[B]` bool, whether every dot
             that was found in the previous frame was found again.
         """
+        before = base.new_full((1, *self.pixels.shape), torch.nan) if previous is None else previous
+        if is_native(known, base, before, self.pixels):
+            return _parts(found_by(followed, self.following(), (known, base, before), 8, len(self.pixels)))
         flow, found = self.flow_before(previous)
         weight, flow = found.to(base.dtype), flow.mT
         state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
@@ -223,6 +237,8 @@ class DotMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the result that follows from the found dots alone, equal to the last digit for followed and searched dots; and
         in which frames `[B]` all are found, so that none can be at another's blob."""
+        if is_native(weight, flow, known, base, self.pixels):
+            return _parts(found_by(sure_states, self.following(), (weight, flow, known, base), 8, len(self.pixels)))
         complete = ((weight >= FOUND) | ~self.seen).all(-1)
         weight, flow, strain = self.from_sure(weight, flow, strain, known, base)
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
@@ -236,6 +252,9 @@ class DotMatcher(nn.Module):
     @traced
     def unstrained(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Return the `scene` of blobs without measured strain."""
+        if is_native(blobs, log_radius, valid, self.pixels):
+            known = F.pad(F.pad((blobs - self.origin).mT, (0, 0, 1, 0), value=1.0), (0, 0, 0, 4))
+            return known, self.base(blobs, log_radius, valid)
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
         return self.scene(eye[..., None].expand(*valid.shape[:1], 2, 2, valid.shape[1]), blobs, log_radius, valid)
 
@@ -256,7 +275,17 @@ class DotMatcher(nn.Module):
         strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         position = (blobs - self.origin).mT
         known = torch.cat([torch.ones_like(position[:, :1]), position, strain.flatten(1, 2)], 1)
-        return known, self.misfit(log_radius, valid) + self.stiffness[:, None] * position.square().sum(1, keepdim=True)
+        return known, self.base(blobs, log_radius, valid)
+
+    def base(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> Tensor:
+        """Return the part `[B, D, K]` of the cost of `choose` that does not depend on the prediction."""
+        if is_native(blobs, log_radius, valid, self.pixels):
+            buffers = (buffer.numpy() for buffer in (self.log_radius, self.stiffness, self.origin))
+            return found_by(
+                bases, (*buffers, self.size_tolerance), (blobs, log_radius, valid), len(self.pixels), blobs.shape[1]
+            )
+        square = (blobs - self.origin).mT.square().sum(1, keepdim=True)
+        return self.misfit(log_radius, valid) + self.stiffness[:, None] * square
 
     def misfit(self, log_radius: Tensor, valid: Tensor) -> Tensor:
         """Return the misfit of the blobs' sizes to the dots, `[B, D, K]`, squared standard deviations; blobs that are no dots
@@ -288,3 +317,8 @@ class DotMatcher(nn.Module):
     def end(self, weight: Tensor, flow: Tensor, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions, certainty and strain in the form of `forward`."""
         return self.pixels + self.origin + flow.mT, weight, strain.movedim(-1, 1)
+
+
+def _parts(found: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return weight, flow, strain and a property of frames from `found [B, 8, D]` of `native_match`."""
+    return found[:, 0], found[:, 1:3], found[:, 3:7].unflatten(1, (2, 2)), found[:, 7, 0] > 0

@@ -4,13 +4,10 @@ On a processor the tensor operations of a step, some seventy, take longer to beg
 `flow` and `match`, which say what they mean; a test holds both to the same numbers. In single precision only.
 """
 
-from typing import Any
-
 import numpy as np
-import torch
-from torch import Tensor
 
-from ...machine_code import Kept, compiled, fingerprint, kept, takes
+from ...machine_code import Kept, compiled, fingerprint, kept
+from ..native_frames import KEPT_STEPS
 
 
 @compiled
@@ -123,20 +120,4 @@ def choices(c, predicted, support, blobs, base, found):
 
 
 SOURCES = fingerprint(__file__)
-KEPT_STEPS = {function: Kept(function, SOURCES, 3) for function in (gradients, flows, choices)}
-
-
-def is_native(*values: Tensor) -> bool:
-    """Return whether machine code computes the step of the matching for these tensors."""
-    return all(value.dtype == torch.float32 for value in values) and takes(*values)
-
-
-def found_by(function: Any, constants: tuple[Tensor, ...], given: tuple[Tensor, ...], *shape: int) -> Tensor:
-    """Return the results `[B, *shape]` of one of these functions, from the constants of a pattern and the tensors `given` of
-    the frames."""
-    frames = next((len(value) for value in given if len(value) != 1), 1)
-    found = given[0].new_empty(frames, *shape)
-    with KEPT_STEPS[function].compiling(np.dtype(np.float32)):
-        each = (value.expand(frames, *value.shape[1:]).contiguous().numpy() for value in given)
-        function(tuple(value.numpy() for value in constants), *each, found.numpy())
-    return found
+KEPT_STEPS.update({function: Kept(function, SOURCES, 3) for function in (gradients, flows, choices)})
