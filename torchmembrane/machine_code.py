@@ -22,8 +22,8 @@ from torch import Tensor
 
 from .interruption import unstoppable
 
-SECONDS = 45
-"""Approximate time to compile the steps for one precision: 30 s on a core with AVX-512, 52 s on an AMD EPYC core with AVX2, in
+SECONDS = 65
+"""Approximate time to compile the steps for one precision: 65 s of processor time on a core with AVX-512 beside other work, in
 `python tests/compile.py float32` with an empty `NUMBA_CACHE_DIR`."""
 
 _used = ContextVar("machine code is used", default=True)
