@@ -64,7 +64,7 @@ def test_compiling_is_said_once_with_its_expected_time(function, caplog):
             with code.compiling(DOUBLE):
                 pass
     assert [record.getMessage() for record in caplog.records] == [
-        "torchmembrane: compiling machine code for float64, about 65 s, once"
+        "torchmembrane: compiling machine code for float64, about 60 s, once"
     ]
 
 

@@ -8,6 +8,7 @@ import hashlib
 import logging
 import platform
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
@@ -22,9 +23,9 @@ from torch import Tensor
 
 from .interruption import unstoppable
 
-SECONDS = 65
-"""Approximate time to compile the steps for one precision: 65 s of processor time on a core with AVX-512 beside other work, in
-`python tests/compile.py float32` with an empty `NUMBA_CACHE_DIR`."""
+SECONDS = 60
+"""Approximate time to compile the steps for one precision: with the contacts, 70 s on a virtual core of an Intel Xeon with
+AVX-512, in `python tests/compile.py float32` with an empty `NUMBA_CACHE_DIR`."""
 
 _used = ContextVar("machine code is used", default=True)
 
@@ -60,6 +61,16 @@ def takes(*values: Any) -> bool:
         and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
         and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
     )
+
+
+def in_threads(take: Callable[..., Any], *values: np.ndarray) -> None:
+    """Call `take` on parts of the arrays `values [B, ...]`, with as many threads as torch uses, but at most one for a frame."""
+    threads = min(torch.get_num_threads(), len(values[0]))
+    if threads <= 1:
+        take(*values)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(take, *(np.array_split(each, threads) for each in values)))
 
 
 OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})

@@ -1,13 +1,14 @@
 """Calls of machine code that works on the tensors of several frames, in single precision."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..machine_code import Kept, compiled, takes
+from ..machine_code import Kept, compiled, in_threads, takes
 
 KEPT_STEPS: dict[Any, Kept] = {}
 """The functions `found_by` can call, of constants and frames, which fill an array of results: whether each is compiled."""
@@ -25,7 +26,7 @@ def found_by(function: Any, constants: tuple[Any, ...], given: tuple[Tensor, ...
     found = given[0].new_empty(frames, *shape)
     with KEPT_STEPS[function].compiling(np.dtype(np.float32)):
         each = (value.expand(frames, *value.shape[1:]).contiguous().numpy() for value in given)
-        function(constants, *each, found.numpy())
+        in_threads(partial(function, constants), *each, found.numpy())
     return found
 
 

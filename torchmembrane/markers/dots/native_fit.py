@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...machine_code import Kept, compiled, fingerprint, kept
+from ...machine_code import Kept, compiled, fingerprint, in_threads, kept
 from .scales import FAINT
 
 MISFIT = 0.02
@@ -278,8 +278,13 @@ class NativeFit:
             centre.new_empty(*centre.shape[:2], 6),
             torch.empty_like(shape, memory_format=torch.contiguous_format),
         )
+        constants = self._found(fit)
+
+        def take(*part: np.ndarray) -> None:
+            fits(constants, *part[:-2], steps, *part[-2:])
+
         with kept_fits.compiling(np.dtype(np.float32)):
-            fits(self._found(fit), *images, *given, steps, dots.numpy(), covariance.numpy())
+            in_threads(take, *images, *given, dots.numpy(), covariance.numpy())
         return dots[..., :2], covariance, *dots[..., 2:].unbind(-1)
 
     def _found(self, fit: Any) -> Constants:

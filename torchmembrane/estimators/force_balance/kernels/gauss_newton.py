@@ -14,8 +14,20 @@ from ....solve.symmetric_2x2 import symmetric_solution
 from ....vectors import BYTES
 from ..camera_motion import camera_stiffness
 from ..schedule import LEAST_MOVE, RELAXATION, falling, outlier_scale, scaled_step, share_of_next
-from .equations import CAMERA, FLUID, FORCES, VOLUME, WANTED, load_forces, load_weighted_forces, scale_rows, stiffness_change
-from .equations import sum_blocks, weigh, write_vertices
+from .equations import (
+    CAMERA,
+    FLUID,
+    FORCES,
+    VOLUME,
+    WANTED,
+    load_forces,
+    load_weighted_forces,
+    scale_rows,
+    stiffness_change,
+    sum_blocks,
+    weigh,
+    write_vertices,
+)
 from .markers import load_markers, load_markers_after
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)

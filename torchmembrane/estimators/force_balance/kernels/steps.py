@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .... import vectors
-from ....machine_code import Kept, fingerprint, kept
+from ....machine_code import Kept, fingerprint, in_threads, kept
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
 from ....mechanics.native_membrane import Surface, surface_of
@@ -122,9 +121,9 @@ class NativeSteps:
     ) -> None:
         """Call `frames` on parts of the arrays `each`, the last of which is `found`, with one thread per part."""
         numbers = np.array(given, float)
-        grid, dtype, threads = equations.forces.membrane.grid, each[0].dtype, min(torch.get_num_threads(), len(each[0]))
+        grid, dtype = equations.forces.membrane.grid, each[0].dtype
 
-        def take(part: Sequence[np.ndarray]) -> None:
+        def take(*part: np.ndarray) -> None:
             try:
                 work = self._idle[dtype].pop()
             except IndexError:
@@ -133,11 +132,7 @@ class NativeSteps:
                 frames(constants, work, *part[:-1], numbers, part[-1])
             self._idle[dtype].append(work)
 
-        if threads <= 1:
-            take(each)
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(take, zip(*(np.array_split(values, threads) for values in each), strict=True)))
+        in_threads(take, *each)
 
     def _found(self, equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Constants:
         forces, loss, bearings = equations.forces, equations.loss, equations.bearings
