@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...machine_code import Kept, compiled, fingerprint, kept
+from .. import native_frames
 from ..native_frames import KEPT_STEPS, largest
+from . import probability, scales
 from .probability import LEAST, contrast_evidence
 from .scales import FAINT
 
@@ -95,18 +97,6 @@ def _on_cells(c, response, found):
                 found[i, k] = response[i, k]
 
 
-@kept
-def responses(c, levels, found):
-    """Fill `found [B, rows, columns]` for images `[B, H, W]` of the scale's level."""
-    m, n = len(c.along_v), c.along_u.shape[1]
-    row, blurred = np.empty(n + len(c.along_u) - 1, np.float32), np.empty((m, n), np.float32)
-    response = np.empty((m - 2, n - 2), np.float32)
-    for b in range(len(found)):
-        _blurred(c, levels[b], row, blurred)
-        _response(blurred, response)
-        _on_cells(c, response, found[b])
-
-
 @compiled
 def _is_highest(peak, i, k, reach):
     """Whether no cell around is higher."""
@@ -158,44 +148,58 @@ def _blob(c, scales, peak, cell, height, found):
     found[2], found[3] = total / max(weight, np.float32(1e-20)), strength
 
 
-@kept
-def peaks(c, scales, background, found):
-    """Fill `found [B, K, 4]`: centre, log radius, strength; from `scales [B, S, rows, columns]`."""
-    peak, count = np.empty_like(c.inside), found.shape[1]
-    values, places, cells = np.empty(peak.size, np.float32), np.empty(peak.size, np.int64), np.empty(count, np.int64)
-    for b in range(len(found)):
-        for i in range(len(peak)):
-            for k in range(peak.shape[1]):
-                highest = scales[b, 0, i, k]
-                for s in range(1, scales.shape[1]):
-                    highest = max(highest, scales[b, s, i, k])
-                peak[i, k] = highest / (background[b, i, k] * background[b, i, k]) * c.inside[i, k]
-        maxima, flat = _maxima(c, peak, values, places, cells), peak.reshape(-1)
-        for k in range(count):
-            height = flat[cells[k]] if k < maxima else np.float32(0)
-            _blob(c, scales[b], peak, cells[k], height, found[b, k])
+def _entries(sources: str) -> Any:
+    @kept
+    def responses(c, levels, found):
+        """Fill `found [B, rows, columns]` for images `[B, H, W]` of the scale's level."""
+        m, n = len(c.along_v), c.along_u.shape[1]
+        row, blurred = np.empty(n + len(c.along_u) - 1, np.float32), np.empty((m, n), np.float32)
+        response = np.empty((m - 2, n - 2), np.float32)
+        for b in range(len(found) if sources else 0):
+            _blurred(c, levels[b], row, blurred)
+            _response(blurred, response)
+            _on_cells(c, response, found[b])
+
+    @kept
+    def peaks(c, scales, background, found):
+        """Fill `found [B, K, 4]`: centre, log radius, strength; from `scales [B, S, rows, columns]`."""
+        peak, count = np.empty_like(c.inside), found.shape[1]
+        values, places, cells = np.empty(peak.size, np.float32), np.empty(peak.size, np.int64), np.empty(count, np.int64)
+        for b in range(len(found) if sources else 0):
+            for i in range(len(peak)):
+                for k in range(peak.shape[1]):
+                    highest = scales[b, 0, i, k]
+                    for s in range(1, scales.shape[1]):
+                        highest = max(highest, scales[b, s, i, k])
+                    peak[i, k] = highest / (background[b, i, k] * background[b, i, k]) * c.inside[i, k]
+            maxima, flat = _maxima(c, peak, values, places, cells), peak.reshape(-1)
+            for k in range(count):
+                height = flat[cells[k]] if k < maxima else np.float32(0)
+                _blob(c, scales[b], peak, cells[k], height, found[b, k])
+
+    @kept
+    def validities(c, blobs, strength, found):
+        """Fill `found [B, K]` with the probability that each blob is a dot: `DotLocator.validity`."""
+        pixels, strengths = c
+        for b in range(len(found) if sources else 0):
+            level = 0.0
+            for k in range(found.shape[1]):
+                best, own = np.float32(np.inf), 0
+                for d in range(len(pixels)):
+                    square = (blobs[b, k, 0] - pixels[d, 0]) ** 2 + (blobs[b, k, 1] - pixels[d, 1]) ** 2
+                    if square < best:
+                        best, own = square, d
+                found[b, k] = strength[b, k] / strengths[own]
+                if k < len(pixels) // 2:
+                    level += found[b, k] / (len(pixels) // 2)
+            for k in range(found.shape[1]):
+                found[b, k] = 1 / (1 + np.exp(-_contrast_evidence(found[b, k] / max(level, LEAST), FAINT)))
+
+    return responses, peaks, validities
 
 
-@kept
-def validities(c, blobs, strength, found):
-    """Fill `found [B, K]` with the probability that each blob is a dot: `DotLocator.validity`."""
-    pixels, strengths = c
-    for b in range(len(found)):
-        level = 0.0
-        for k in range(found.shape[1]):
-            best, own = np.float32(np.inf), 0
-            for d in range(len(pixels)):
-                square = (blobs[b, k, 0] - pixels[d, 0]) ** 2 + (blobs[b, k, 1] - pixels[d, 1]) ** 2
-                if square < best:
-                    best, own = square, d
-            found[b, k] = strength[b, k] / strengths[own]
-            if k < len(pixels) // 2:
-                level += found[b, k] / (len(pixels) // 2)
-        for k in range(found.shape[1]):
-            found[b, k] = 1 / (1 + np.exp(-_contrast_evidence(found[b, k] / max(level, LEAST), FAINT)))
-
-
-SOURCES = fingerprint(__file__)
+SOURCES = fingerprint(__file__, native_frames.__file__, probability.__file__, scales.__file__)
+responses, peaks, validities = _entries(SOURCES)
 KEPT_STEPS.update({function: Kept(function, SOURCES, 4) for function in (responses, peaks, validities)})
 
 

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...machine_code import Kept, compiled, fingerprint, kept
+from .. import native_frames, spacing
 from ..native_frames import KEPT_STEPS, largest
 from ..spacing import FADED
-from . import native_flow
+from . import native_flow, probability, scales, seams
 from .native_flow import _along, _gradient
 from .probability import (
     LEAST,
@@ -197,7 +198,8 @@ def _entries(sources: str) -> Any:
     return outlines, verdicts
 
 
-SOURCES = fingerprint(__file__, native_flow.__file__)
+SHARED = native_flow, native_frames, probability, scales, seams, spacing
+SOURCES = fingerprint(__file__, *(module.__file__ for module in SHARED))
 outlines, verdicts = _entries(SOURCES)
 KEPT_STEPS.update({outlines: Kept(outlines, SOURCES, 2), verdicts: Kept(verdicts, SOURCES, 5)})
 
