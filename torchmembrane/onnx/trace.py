@@ -11,7 +11,7 @@ from onnx import TensorProto
 from onnx_ir import passes
 from onnx_ir.passes import common
 from onnxscript import opset18
-from onnxscript.function_libs.torch_lib.ops.core import aten_index_select, aten_scalar_tensor
+from onnxscript.function_libs.torch_lib.ops.core import aten_full, aten_full_like, aten_index_select, aten_scalar_tensor
 from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
 
@@ -25,6 +25,8 @@ HUGE = (1 << 31) - 1
 """Values from here on mean the end of an axis and are not lengths."""
 LENGTHS = 8
 """Largest number of elements of a tensor of lengths."""
+UNTOLD = -1
+"""A precision that an operation does not tell."""
 NUMBERS = (ir.AttributeType.INT, ir.AttributeType.INTS, ir.AttributeType.FLOAT, ir.AttributeType.FLOATS)
 
 TIDY = passes.Sequential(
@@ -46,6 +48,37 @@ def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: 
     return opset18.Constant(value=number)
 
 
+def _full(size: Any, fill_value: Any, dtype: int = TensorProto.FLOAT, **others: Any) -> Any:
+    """Translate `torch.full` to ONNX, keeping double precision."""
+    return aten_full(size, _number(fill_value, dtype), dtype, **others)
+
+
+def _new_full(self: Any, size: Any, fill_value: Any, dtype: int = UNTOLD, **others: Any) -> Any:
+    """Translate `torch.new_full` to ONNX, keeping double precision."""
+    return _full(size, fill_value, _told(dtype, self), **others)
+
+
+def _full_like(self: Any, fill_value: Any, dtype: int = UNTOLD, **others: Any) -> Any:
+    """Translate `torch.full_like` to ONNX, keeping double precision."""
+    dtype = _told(dtype, self)
+    return aten_full_like(self, _number(fill_value, dtype), dtype, **others)
+
+
+def _masked_fill(self: Any, mask: Any, value: Any) -> Any:
+    """Translate `torch.masked_fill` to ONNX, keeping double precision."""
+    return opset18.Where(mask, _number(value, self.dtype.value), self)
+
+
+def _power(self: Any, exponent: Any) -> Any:
+    """Translate `torch.pow` of a number to ONNX, keeping double precision."""
+    return opset18.Pow(_number(self, exponent.dtype.value), exponent)
+
+
+def _told(dtype: int, tensor: Any) -> int:
+    """Return a precision if it is told, else that of a tensor."""
+    return int(tensor.dtype.value) if dtype == UNTOLD else dtype
+
+
 def _selected(self: Any, dim: int, index: Any) -> Any:
     """Translate `torch.index_select` to ONNX.
 
@@ -59,7 +92,17 @@ def _selected(self: Any, dim: int, index: Any) -> Any:
     return opset18.GatherElements(self, opset18.Expand(index, shape), axis=len(others))
 
 
-EXPORTER = TorchExporter({torch.ops.aten.scalar_tensor.default: _number, torch.ops.aten.index_select.default: _selected})
+EXPORTER = TorchExporter(
+    {
+        torch.ops.aten.scalar_tensor.default: _number,
+        torch.ops.aten.full.default: _full,
+        torch.ops.aten.new_full.default: _new_full,
+        torch.ops.aten.full_like.default: _full_like,
+        torch.ops.aten.masked_fill.Scalar: _masked_fill,
+        torch.ops.aten.pow.Scalar: _power,
+        torch.ops.aten.index_select.default: _selected,
+    }
+)
 """The exporter, with scalars in double precision (torch rounds them to single) and an `index_select` fast in onnxruntime."""
 
 

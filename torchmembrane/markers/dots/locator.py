@@ -28,10 +28,10 @@ from .scales import FAINT, REACH, STEPS
 from .seams import Seams
 
 DIGITS = 8.0  # added to a value in 0..1, it leaves float32 with 20 binary digits after the point
-BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
-"""Steps to which the blobs' centres (px), shares of one, the noise (grey) and the confidence are rounded. The start of the fit
-is not known more finely, and after rounding it is the same in every runtime. The confidence is rounded for every
-sensor: its last bits depend on the place of the frame in its batch, and would change the frame's result."""
+BLOB, SHARE, NOISE, PIXEL, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 2.0**-14, 1 / 256
+"""Steps to which the blobs' centres (px), shares of one, the noise (grey), the fitted dots' centres (px) and the confidence are
+rounded. None of them is known more finely, and after rounding they are the same in every runtime. The confidence is rounded for
+every sensor: its last bits depend on the place of the frame in its batch, and would change the frame's result."""
 LARGEST_STRAIN = 0.5  # largest strain of the outlines from which the fit starts
 SPARE = 1.3  # number of blobs searched per dot
 
@@ -98,7 +98,19 @@ def rounded(value: Tensor, step: float) -> Tensor:
         >>> rounded(torch.tensor([0.3, 7.0]), 0.125).tolist()
         [0.25, 7.0]
     """
-    return value + ((value.detach() / step).round() * step - value.detach())
+    fixed = value.detach()
+    return (fixed / step).round() * step + (value - fixed)
+
+
+def in_few_digits(value: Tensor) -> Tensor:
+    """Round a value in double precision to 12 binary digits.
+
+    Example:
+        >>> bool(in_few_digits(torch.tensor(0.7).double()) == round(0.7 * 2**12) / 2**12)
+        True
+    """
+    far = value * (2.0**41 + 1)
+    return far - (far - value)
 
 
 class DotLocator(nn.Module):
@@ -233,7 +245,8 @@ class DotLocator(nn.Module):
         fitted = self.fit([level_0, level_1, level_2], place, self.outlines(certainty, place, strain), noise, STEPS)
         size = level_0.shape[-1], level_0.shape[-2]
         pixels, confidence = self.judged(fitted, strain, blobs, log_radius, valid, size)
-        return LocatedMarkers(pixels, confidence, fitted.covariance)
+        covariance = in_few_digits(fitted.covariance) if self.is_exact else fitted.covariance
+        return LocatedMarkers(self._alike(pixels, PIXEL), confidence, covariance)
 
     def outlines(self, certainty: Tensor, place: Tensor, strain: Tensor) -> Tensor:
         """Return the outlines `[B, D, 2, 2]` from which the fits start: those at rest under the gradient of the flow."""
