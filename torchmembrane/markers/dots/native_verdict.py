@@ -34,7 +34,7 @@ class Verdict(NamedTuple):
     """Constants of a pattern, as of the modules from which they come."""
 
     averages: Any
-    """`FlowAverages._constants`"""
+    """`FlowAverages.constants`"""
     rest: Any
     """`[D, 2]`, px."""
     shapes: Any
