@@ -162,6 +162,15 @@ def test_a_frame_of_nan_changes_no_other(locator, images):
         torch.testing.assert_close(one[::2], other[::2], rtol=0, atol=0)
 
 
+def test_threads_that_share_the_frames_of_a_batch_locate_alike(locator, images):
+    threads, alone = torch.get_num_threads(), locator(images)
+    try:
+        torch.set_num_threads(2)
+        agree(locator(images), alone, 0, 0, 0)
+    finally:
+        torch.set_num_threads(threads)
+
+
 def test_gradients_are_left_to_tensors_and_copies_locate_alike(locator, images):
     traced = images[:1].clone().requires_grad_()
     locator(traced).pixels.sum().backward()
