@@ -61,12 +61,12 @@ def line(name: str, rows: list[dict], of: str) -> dict[str, float]:
     wide = np.median(deviation / size) / np.sqrt(np.mean((error / size) ** 2))
     drawn = np.abs(np.random.default_rng(0).normal(size=(DRAWS, len(rows)))) * deviation
     normal = np.mean([spearmanr(each, deviation).statistic for each in drawn])
-    ranks = float(spearmanr(error, deviation).statistic)
+    ranks, shallow = float(spearmanr(error, deviation).statistic), float(np.median(-signed / size))
     print(
         f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {ranks:.2f} ({normal:.2f})"
-        + (f", too shallow by {np.median(-signed / size):.2f}" if of == "depth" else "")
+        + (f", too shallow by {shallow:.2f}" if of == "depth" else "")
     )
-    return dict(held=float(held), width=float(wide), ranks=ranks, shallow=float(np.median(-signed / size)))
+    return dict(held=float(held), width=float(wide), ranks=ranks, shallow=shallow)
 
 
 def report(rows: list[dict]) -> list[dict]:

@@ -16,7 +16,8 @@ from typing import NamedTuple
 from ..errors import MembraneError
 from .safe_read import in_one_line, printable, read_text, shortened
 
-NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+NUMBER = re.compile(r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
+"""What is read as a number; `float` also takes 1_000, and digits of other scripts."""
 COMMENT = re.compile(r"\s*#+(\s|$)")
 QUOTED = re.compile(r"[\w.,;+ ()\[\]-]{0,60}")
 """A first line that an error message may quote; of any other line it states only the length, as the content may be
@@ -93,14 +94,12 @@ class Row(NamedTuple):
 
     def number(self, column: str, limit: Limit = ANY) -> float:
         """Return a finite number within its limit; otherwise raise a `MembraneError` that names file, line and column."""
-        try:
-            value = float(cell := self.text(column).translate(MINUS))
-        except ValueError:
-            raise self.refusal(column, "a number such as 12 or 1.5, with a point and not a comma") from None
+        cell = self.text(column).translate(MINUS)
+        if not NUMBER.fullmatch(cell):
+            raise self.refusal(column, "a number such as 12 or 1.5, with a point and not a comma")
+        value = float(cell)
         if not math.isfinite(value):
             raise self.refusal(column, "a finite number: leave the line out where it is unknown")
-        if not NUMBER.fullmatch(cell):  # Python takes 1_000, and digits of other scripts
-            raise self.refusal(column, "a number such as 12 or 1.5, with a point and not a comma")
         if abs(value) > limit.most:
             raise self.refusal(column, f"{limit.what} up to {limit.most:g}, in {limit.unit}")
         return value
