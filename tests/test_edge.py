@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+import torch
 from onnx import TensorProto, helper
 from PIL import Image
 
@@ -607,6 +608,27 @@ def test_results_of_the_same_model_are_added_to(model, call, images, tmp_path):
     assert sorted(path.name for path in (tmp_path / "r").iterdir()) == ["a.npz", "b.npz", "mesh.npz", *tables]
 
 
+def test_a_result_of_an_image_that_cannot_be_read_any_more_is_removed(model, call, images, tmp_path):
+    paths = [images(name, GREY) for name in ("a.png", "b.png")]
+    assert call(model, *paths, "--out", tmp_path / "r")[0] == 0
+    paths[1].write_bytes(paths[1].read_bytes()[:50])
+    assert call(model, *paths, "--out", tmp_path / "r")[0] == 1
+    assert sorted(path.name for path in (tmp_path / "r").glob("*.npz")) == ["a.npz", "mesh.npz"]
+
+
+@pytest.mark.parametrize("count, left", [(2, ["a_000000", "a_000001"]), (1, ["a"])])
+def test_results_of_pictures_that_a_file_no_longer_contains_are_removed(count, left, model, call, images, tmp_path):
+    assert call(model, images("a.tif", SEQUENCES["a.tif"]), "--out", tmp_path / "r")[0] == 0
+    assert call(model, images("a_000007.png", GREY), "--out", tmp_path / "r")[0] == 0  # of another file: kept
+    pictures = [Image.fromarray(GREY)] * count
+    code, _, err = call(model, images("a.tif", pictures[0], save_all=True, append_images=pictures[1:]), "--out", tmp_path / "r")
+    names = [*left, "a_000007"]
+    assert code == 0 and "a_000002 removed, as the file does not contain this picture any more" in err
+    assert sorted(path.stem for path in (tmp_path / "r").glob("a*.npz")) == sorted(names)
+    with open(tmp_path / "r" / "summary.csv", newline="") as file:
+        assert [row["name"] for row in csv.DictReader(file)] == names
+
+
 def test_a_full_disk_is_told_with_the_file_and_leaves_no_half_one(model, call, images, tmp_path, monkeypatch):
     write, left = Path.write_bytes, [3000]
 
@@ -807,6 +829,7 @@ NO_IMAGES = {
     "an empty list": ([], r"images \[0\]; expected"),
     "a text": ("press.png", r"images \[\]; expected"),
     "rows of different lengths": ([[1, 2], [3]], "images are not an array"),
+    "a tensor that requires gradients": (torch.zeros(6, 8, requires_grad=True), "images are not an array"),
     "whole numbers": (GREY.astype(int), "images of type int64; expected uint8, uint16 or float in 0..1"),
     "truths": (GREY > 3, "images of type bool"),
     "objects": (GREY.astype(object), "images of type object"),

@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 import quickly_saving
 import torch
-from test_batch import CONTRACT, NPZ, PARQUET, Denting, grey_image, reconstruct, summary_of
+from PIL import Image
+from test_batch import CONTRACT, HEIGHT, NPZ, PARQUET, WIDTH, Denting, grey_image, reconstruct, summary_of
 
 from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
@@ -102,6 +103,65 @@ def test_a_new_image_under_an_old_name_is_done_again(images, tmp_path, settings)
     assert float(read_results(tmp_path / "out")["i1"]["pressure"]) == pytest.approx(200 / 255, abs=1e-5)
     assert summary_of(tmp_path / "out")["i1"]["content_hash"] == SourceFile.from_files(images[1]).content_hash
     assert reconstruct(images, tmp_path / "out", settings)[0] == (0, 0, 0, 0, 0, 0, 5)
+
+
+def stack(path: Path, *levels: int) -> Path:
+    pages = [Image.new("L", (WIDTH, HEIGHT), level) for level in levels]
+    pages[0].save(path, save_all=True, append_images=pages[1:])
+    return path
+
+
+@both
+@pytest.mark.parametrize("pages, left", [((200, 210), ["run_000000", "run_000001"]), ((200,), ["run"])])
+def test_frames_that_a_changed_file_no_longer_contains_are_removed(pages, left, tmp_path, settings):
+    reconstruct([stack(tmp_path / "run.tif", 40, 50, 60, 70)], tmp_path / "out", settings)
+    other = grey_image(tmp_path / "run_000003.png", 90)
+    reconstruct([other], tmp_path / "out", settings)  # of another file: kept
+    outcome, lines, _ = reconstruct([stack(tmp_path / "run.tif", *pages)], tmp_path / "out", settings)
+    names = [*left, "run_000003"]
+    assert outcome.reconstructed == len(pages) and sorted(read_results(tmp_path / "out").names) == names
+    assert sorted(summary_of(tmp_path / "out")) == names and "removed, as the changed file does not contain" in lines[-1]
+    found = [float(read_results(tmp_path / "out")[name]["pressure"]) for name in names]
+    np.testing.assert_allclose(found, np.array([*pages, 90]) / 255, atol=1e-5)
+
+
+def test_frames_that_a_changed_file_may_still_contain_are_kept(tmp_path):
+    path = stack(tmp_path / "run.tif", 40, 50, 60, 70)
+    reconstruct([path], tmp_path / "out")
+    path.write_bytes(path.read_bytes()[:-100])
+    outcome, lines, _ = reconstruct([path], tmp_path / "out")
+    assert outcome.failed and read_results(tmp_path / "out").names[-1] > "run_000000"
+    assert not any("removed" in line for line in lines)
+
+
+class Gauged(Denting):
+    """The reading of a frame is its pressure."""
+
+    def __call__(self, images, pressure):
+        return super().__call__(images)._replace(pressure=pressure)
+
+
+@both
+def test_a_frame_with_another_gauge_reading_is_done_again(images, tmp_path, settings):
+    readings = {f"i{k}": 0.1 + k for k in range(4)}
+    settings = settings._replace(pressure="gauge.csv")
+    reconstruct(images[:4], tmp_path / "out", settings, Gauged(), pressure=readings)
+    same = reconstruct(images, tmp_path / "out", settings, Gauged(), pressure=readings)
+    assert same[0] == (1, 0, 0, 0, 0, 0, 4) and same[1] == []
+    outcome, lines, _ = reconstruct(images, tmp_path / "out", settings, Gauged(), pressure=readings | {"i1": 7.0, "i4": 9.0})
+    assert outcome == (2, 0, 0, 0, 0, 0, 3) and lines == ["i1 and 1 more: the gauge reading has changed, done again"]
+    results = read_results(tmp_path / "out")
+    assert [float(results[f"i{k}"]["pressure"]) for k in range(5)] == pytest.approx([0.1, 7.0, 2.1, 3.1, 9.0])
+
+
+def test_a_name_is_that_of_a_picture_only_as_it_is_written(tmp_path):
+    path = stack(tmp_path / "run.tif", 40, 50)
+    inputs = find_inputs([path])
+    assert inputs.video_of("run_000001") == path and inputs.video_of("run_1000001") == path
+    assert not any(
+        map(inputs.video_of, ("run_1", "run_0000001", "run_\u0661\u0661\u0661\u0661\u0661\u0661", "run_", "other_000001"))
+    )
+    assert len(find_inputs([path, grey_image(tmp_path / "run_1.png", 90)]).images) == 1
 
 
 def test_results_without_hashes_are_kept_and_that_is_said_once(images, tmp_path):

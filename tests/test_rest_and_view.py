@@ -155,6 +155,33 @@ def test_a_recording_brings_its_own_rest(fingertip, tmp_path, capsys):
     assert main([*again, "--rest", "first:none"]) == 2
 
 
+def test_the_sensor_s_own_rest_image_shows_no_contact_whatever_the_error_of_its_file(fingertip, tmp_path, capsys):
+    """A membrane that the file says to be too high lies deeper in the rest image, which is no press of the recording."""
+    sensor, _ = fingertip
+    a, b, height = sensor.surface.values["semi_axes"]
+    surface = replace(sensor.surface, values=sensor.surface.values | {"semi_axes": [a, b, 1.05 * height]})
+    base, positions = sensor.surface.values["base_z"], sensor.markers.positions.copy()
+    positions[:, 2] = base + 1.05 * (positions[:, 2] - base)
+    high = replace(
+        sensor, surface=surface, membrane=surface.membrane((17, 17)), markers=replace(sensor.markers, positions=positions)
+    )
+    path, rest = high.to_file(tmp_path / "sensor.toml"), str(tmp_path / "own.png")
+    assert tm.Reconstructor.from_file(path).observer.rest_offset() > 1.0
+    Image.fromarray(np.rint(255 * sensor.markers.rest_image).astype(np.uint8)).save(rest)
+    assert main(["reconstruct", str(path), rest, "--out", str(tmp_path / "out"), "--rest", rest]) == 0
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_results_by_other_rest_images_of_the_same_names_are_refused(fingertip, tmp_path, capsys):
+    sensor, simulator = fingertip
+    path, rest = sensor.to_file(tmp_path / "sensor.toml"), str(tmp_path / "rest.png")
+    command = ["reconstruct", str(path), rest, "--out", str(tmp_path / "out"), "--rest", rest]
+    for seed, code in ((3, 0), (3, 0), (4, 2)):
+        Image.fromarray(simulator.image(simulator.membrane.rest, np.random.default_rng(seed))).save(rest)
+        assert main(command) == code
+    assert f"the images of --rest {rest} have changed since its results were made" in capsys.readouterr().err
+
+
 def test_a_rest_that_is_a_press_is_said(fingertip, tmp_path, capsys):
     """With the force of the press, which then reads as none; of an image without contact nothing is said."""
     sensor, simulator = fingertip

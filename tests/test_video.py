@@ -256,6 +256,23 @@ def test_a_video_of_another_size_is_refused_once(tmp_path):
     assert outcome.failed == len(lines) == 1 and "images of 64 x 48 px; expected the sensor's 16 x 12" in lines[0]
 
 
+@pytest.mark.parametrize("name, begun", [("20260927T113829", 1790509109.0), ("press", 0.0)])
+def test_the_time_of_a_cut_video_s_frames_counts_from_its_first(tmp_path, name, begun):
+    """A part of a recording may keep the times of the whole: its pictures are here from 60 s on."""
+    path = tmp_path / f"{name}.mkv"
+    with av.open(str(path), "w") as container:
+        track = container.add_stream("ffv1", rate=10)
+        track.width, track.height, track.pix_fmt = WIDTH, HEIGHT, "gray"
+        for k in range(3):
+            picture = av.VideoFrame.from_ndarray(level(k)[..., 0], format="gray")
+            picture.pts = 600 + k
+            container.mux(track.encode(picture))
+        container.mux(track.encode())
+    reconstruct([path], tmp_path / "out", reconstructor=Denting())
+    times = [float(row["time"]) for row in summary_of(tmp_path / "out").values()]
+    np.testing.assert_allclose(np.array(times) - begun, np.arange(3) / 10, atol=2e-3)
+
+
 def test_a_video_without_times_is_played_at_its_own_pace(tmp_path):
     """A bare H.264 stream: its pictures have no times, and its header says 25 Hz."""
     path = video(tmp_path / "film.h264", 5, image=level, size=(WIDTH, HEIGHT), format="h264")

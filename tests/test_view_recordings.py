@@ -74,6 +74,17 @@ def test_what_was_taken_together_is_together_whatever_is_lost(period, delay):
         assert [sum(pair[w] is not None for pair in found) for w in range(2)] == kept.sum(1).tolist()
 
 
+def test_pictures_of_a_clock_that_is_set_back_are_all_there():
+    """Each view is matched by itself before and after; where the clock is set back, a moment may lack a view."""
+    times = [[10.0, 10.1, 10.2, 10.15, 10.25, 10.35], [10.0, 10.1, 10.2, 10.3, 10.4, 10.5]]
+    found = list(moments([iter([TimedPicture(time, n) for n, time in enumerate(view)]) for view in times]))
+    assert all(any(each is not None for each in moment) for moment in found)
+    for w in range(2):
+        assert [moment[w].picture for moment in found if moment[w] is not None] == list(range(6))
+    alone = [iter([TimedPicture(time, n) for n, time in enumerate((1000.0, 1000.1, 1000.05, 1000.15))])]
+    assert [moment[0].picture for moment in moments(alone)] == [0, 1, 2, 3]
+
+
 def test_videos_of_the_views_are_matched_by_their_times(recorded, tmp_path, capsys):
     """The right video lacks the second picture: that moment is solved by the left one, and said; others are as of images."""
     path, frames, expected, _ = recorded

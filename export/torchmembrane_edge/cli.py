@@ -27,6 +27,8 @@ FINISHED = (0, 3, 7, 8, 9, 10)  # ok; not converged, unexplained, partly hidden,
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
 """File extensions of the images that are taken from a folder."""
 OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
+NUMBER = re.compile("_[0-9]{6,12}$")
+"""Number of a picture, at the end of a frame's name."""
 MOST_BATCH, MOST_NUMBER = 256, 10**9 - 1
 SECONDS_PER_MB = 0.5
 """Seconds that a PC core takes to load a model, per MB."""
@@ -137,9 +139,9 @@ def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> i
     A tracking model treats the frames as a video.
     """
     results.begin(out, session.mesh)
-    summary = Summary(out, session)
-    waiting = (frame for path in first_views(paths, session.views) for frame in _frames(path, session))
-    done, found = Counter(), None
+    summary, files = Summary(out, session), first_views(paths, session.views)
+    waiting = (frame for path in files for frame in _frames(path, session))
+    done, found, names, broken = Counter(), None, set(), set()
     try:
         while group := list(islice(waiting, batch)):
             start = time.perf_counter()
@@ -149,14 +151,28 @@ def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> i
             seconds = (time.perf_counter() - start) / max(len(images), 1)
             rows = ({key: values[row] for key, values in found.items()} for row in range(len(images)))
             for frame in group:
+                names.add(frame.name)
+                broken.update([frame.path] if frame.image is None else [])
                 done[_kept(session, frame, None if frame.image is None else next(rows), seconds, summary) in FINISHED] += 1
     except BaseException:  # interrupted, or no space left
         with suppress(EdgeError):
             summary.write()
         raise
+    _remove_outdated(out, {frame_name(path): path for path in files if path not in broken}, names, summary)
     summary.write()
     print(f"frames: {done[True]} reconstructed, {done[False]} failed; results in {printable(out)}")
     return 1 if done[False] else 0
+
+
+def _remove_outdated(out: Path, files: dict[str, Path], names: set[str], summary: Summary) -> None:
+    """Remove earlier results of pictures that these files, by the names of their frames, do not contain any more."""
+    for earlier in sorted(out.glob("*.npz")):
+        name = earlier.stem
+        file = files.get(name) or files.get(NUMBER.sub("", name))
+        if file and name not in names and results.file_name(earlier) == printable(file.name):
+            results.remove(earlier)
+            summary.remove(name)
+            print(printable(f"{file}: {name} removed, as the file does not contain this picture any more"), file=sys.stderr)
 
 
 def _joined(images: list) -> np.ndarray | list[np.ndarray]:
@@ -192,6 +208,7 @@ def first_views(paths: list[Path], views: Sequence[str]) -> list[Path]:
 def _kept(session: Session, frame: Frame, result: dict | None, seconds: float, summary: Summary) -> int:
     """Write a frame's result and print a line about it; return its status."""
     if result is None:
+        results.remove(summary.path.parent / f"{frame.name}.npz")
         summary.add(frame.name, frame.path, f"unreadable: {frame.reason}", None, {})
         print(frame.says(frame.reason), file=sys.stderr)
         return UNREADABLE

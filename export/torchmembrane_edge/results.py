@@ -80,6 +80,28 @@ def write(path: Path, content: bytes | memoryview) -> None:
         raise EdgeError(f"{cause}; expected a folder with space that can be written: what is done so far is kept") from error
 
 
+def remove(path: Path) -> None:
+    """Remove an earlier result, if there is one.
+
+    Raises:
+        EdgeError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        cause = f"{printable(path)}: an earlier result, cannot be removed ({error.strerror})"
+        raise EdgeError(f"{cause}; expected a folder that can be written: remove it yourself") from error
+
+
+def file_name(path: Path) -> str:
+    """Return the name of the image file of a result; an empty text if it is unknown or the result is damaged."""
+    try:
+        with np.load(path) as file:
+            return Path(file["path"].item()).name
+    except Exception:  # numpy and zipfile raise what they like of damaged files
+        return ""
+
+
 def _read(path: Path) -> dict[str, Any]:
     """Return the texts and numbers of an earlier `mesh.npz`."""
     try:

@@ -220,7 +220,7 @@ def _refuse_providers(providers: Sequence[str]) -> None:
 def _array(images: Any) -> np.ndarray:
     try:
         return np.asarray(images)
-    except ValueError as error:  # rows of different lengths
+    except (ValueError, TypeError, RuntimeError) as error:  # rows of different lengths; a tensor that requires gradients
         raise EdgeError(f"images are not an array ({in_one_line(error)}); expected {SHAPES}") from error
 
 

@@ -45,6 +45,10 @@ class Summary:
         written = {key: escaped(key, text) for key, text in row.items()}
         self.rows[written["name"]] = written
 
+    def remove(self, name: str) -> None:
+        """Remove the row of a frame whose result has been removed."""
+        self.rows.pop(escaped("name", name), None)
+
     def write(self) -> None:
         """Write the table in the order of the frames' names, and the file that explains its columns."""
         write(self.path, _table(NAMES, (self.rows[name] for name in sorted(self.rows, key=numbered))))

@@ -151,7 +151,7 @@ def run(arguments: Namespace) -> int:
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
-    settings = _settings(reconstructor, arguments, format)
+    settings = _settings(reconstructor, arguments, format, inputs)
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, [view.camera for view in sensor.views] if sensor.views_apart else [sensor.camera]):
         print(f"torchmembrane: {remark}", file=sys.stderr)
@@ -196,13 +196,14 @@ def _inputs(arguments: Namespace, views: "list[str]") -> "Inputs":
     return inputs
 
 
-def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str) -> "Settings":
+def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str, inputs: "Inputs") -> "Settings":
     """Return the settings of the results."""
+    from ..jobs.rest import rest_hash
     from ..results.store import Settings
 
     fields = sorted(set(arguments.fields), key=FIELDS.index)
     given = " ".join(arguments.rest), str(arguments.pressure or "")
-    return Settings.from_reconstructor(reconstructor, format, *given, fields)
+    return Settings.from_reconstructor(reconstructor, format, *given, fields, rest_hash(arguments.rest, inputs))
 
 
 def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":

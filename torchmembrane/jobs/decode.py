@@ -101,7 +101,7 @@ def decoded(source: Source, reconstructor: "Reconstructor") -> DecodedFrame:
     try:
         if len(source.name.encode()) > LONGEST_NAME:
             raise MembraneError(f"its name has {len(source.name.encode())} bytes; expected {LONGEST_NAME} at most: rename it")
-        origin = source.origin or source_file_of(*_there(source.file, reconstructor.sensor.views_apart))
+        origin = source.origin or source_file_of(*existing_files(source.file, reconstructor.sensor.views_apart))
         image, lacking = source.load(reconstructor)
         return frame._replace(image=image, origin=origin, lacking=lacking)
     except MembraneError as error:
@@ -158,8 +158,8 @@ def files_of(path: Path, inputs: Inputs) -> list[Path]:
     return [path] if is_bag(path) else view_files(path, inputs.views)
 
 
-def _there(path: Path, views: Sequence[str]) -> list[Path]:
-    """Return those image files of a frame that exist."""
+def existing_files(path: Path, views: Sequence[str]) -> list[Path]:
+    """Return those image files of a frame that exist: of several views, one for each."""
     return [file for file in view_files(path, views) if file.is_file()] or [path]
 
 
@@ -183,24 +183,30 @@ def _frames(path: Path, pictures: Iterator[Picture], files: Sequence[Path]) -> I
         yield Source(picture_name(path, number + 1), path, refusal, SourceFile())
 
 
-def _pictures(path: Path, topic: str | None, size: tuple[int, int], bits: int | None) -> Iterator[Picture]:
+def _pictures(
+    path: Path, topic: str | None, size: tuple[int, int], bits: int | None, keeps_clock: bool = False
+) -> Iterator[Picture]:
     """Yield the pictures of a file of several.
 
-    In a bag, the time is that of the header, or else of the reception; in a video, it counts from the beginning, whose absolute
-    time the file name may give.
+    In a bag, the time is that of the header, or else of the reception; in a video, it counts from the first picture, whose
+    absolute time the file name may give. `keeps_clock`: in a video without a time in its name, keep the times of the file
+    instead, which the videos of several views may share.
     """
     if is_bag(path):
         for each in messages(path, image_topic(path, topic)[0]):
             yield Picture(partial(_bag_image, each.message, size, bits), each.time)
         return
     of_stack, begun = picture_count(path, 1) > 0, time_in(path.stem)
+    first = 0.0 if keeps_clock and isnan(begun) else nan
     begun = 0.0 if isnan(begun) else begun
     for picture in stack_images(path, size, bits) if of_stack else video_pictures(path, size):
         if isinstance(picture, MembraneError):
             yield Picture(partial(_refuse, str(picture)))
         else:
-            after = getattr(picture, "time", None)  # an array has none
-            yield Picture(partial(_image, picture, bits), nan if after is None else begun + after)
+            time = getattr(picture, "time", None)  # an array has none
+            if time is not None and isnan(first):
+                first = time  # cut videos may keep the times of the whole one
+            yield Picture(partial(_image, picture, bits), nan if time is None else begun + time - first)
 
 
 def _pictures_of_views(path: Path, inputs: Inputs, views: Sequence[View]) -> Iterator[Picture]:
@@ -209,7 +215,7 @@ def _pictures_of_views(path: Path, inputs: Inputs, views: Sequence[View]) -> Ite
     files = [path] * len(views) if is_bag(path) else view_files(path, inputs.views)
     topics = inputs.topics if is_bag(path) else [None] * len(views)
     each = zip(files, topics, views, strict=True)
-    streams = [_timed(_pictures(file, topic, view.camera.image_size, view.camera.bits)) for file, topic, view in each]
+    streams = [_timed(_pictures(file, topic, view.camera.image_size, view.camera.bits, True)) for file, topic, view in each]
     for moment in moments(streams):
         loads = [None if picture is None else picture.picture.load for picture in moment]
         yield Picture(partial(_moment, loads), min(picture.time for picture in moment if picture is not None))

@@ -175,7 +175,7 @@ class FrameReconstructor:
             return []
         options: dict[str, Any] = {} if self.rest_pixels is None else {"rest_pixels": self.rest_pixels}
         if self.pressure is not None:
-            readings = [self._reading(frame.name, frame.origin.time) for frame in group]
+            readings = [self.reading(frame.name, frame.origin.time) for frame in group]
             options["pressure"] = torch.tensor(readings, dtype=torch.float64)
         computed = self.reconstructor(torch.cat(images), **options)
         results = Reconstruction(*(field.cpu() for field in computed))
@@ -185,10 +185,10 @@ class FrameReconstructor:
 
     def _measured(self, frame: DecodedFrame) -> SourceFile:
         """Return a frame's provenance, including the gauge reading."""
-        return frame.origin._replace(gauge=float(self._reading(frame.name, frame.origin.time)))
+        return frame.origin._replace(gauge=float(self.reading(frame.name, frame.origin.time)))
 
-    def _reading(self, name: str, time: float) -> float:
-        """Return the gauge reading of a frame, or NaN."""
+    def reading(self, name: str, time: float) -> float:
+        """Return the gauge reading of a frame, or NaN; `time`: that of its `SourceFile`."""
         if callable(self.pressure):
             return self.pressure(name, time)
         return torch.nan if self.pressure is None else self.pressure.get(name, torch.nan)

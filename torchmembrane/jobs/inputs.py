@@ -3,6 +3,7 @@ order of the call."""
 
 import glob
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from filecmp import cmp
@@ -20,6 +21,8 @@ from ..sensor.view_images import view_files
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".gif")
+PICTURE = re.compile("[0-9]{6}|[1-9][0-9]{6,}")
+"""Number of a picture in a frame's name, as `picture_name` writes it."""
 
 
 class Inputs(NamedTuple):
@@ -66,7 +69,7 @@ class Inputs(NamedTuple):
             'press.mp4'
         """
         stem, _, number = name.rpartition("_")
-        return next((path for path in self.videos if frame_name(path) == stem and number.isdigit()), None)
+        return next((path for path in self.videos if frame_name(path) == stem and PICTURE.fullmatch(number)), None)
 
 
 def frame_name(path: Path) -> str:

@@ -112,7 +112,7 @@ def reconstruct_files(
     done, moved = Counter[int](), Counter[str]()
     computed = FrameReconstructor(reconstructor, rest_pixels, pressure, settings.fields.split())
     work = Work(computed, (out, mesh) if figures else None)
-    with ResultFolder(out, mesh, inputs, shard, figures, report) as folder:
+    with ResultFolder(out, mesh, inputs, shard, figures, report, computed.reading) as folder:
         mine = (source for source in sources(inputs, reconstructor) if shard.holds(source.name))
         waiting = (source for source in mine if source.name not in folder.finished)
         with _progress(inputs, shard, folder.finished) as progress:
@@ -123,6 +123,7 @@ def reconstruct_files(
                     moved.update(moved_views(outcome.stored.frame, mesh.view_names.split()) if outcome.stored else ())
                 folder.save()
                 progress.update(len(group), done)
+        folder.remove_outdated()
     if alone := done[Status.VIEW_LEFT_OUT]:
         report(f"a view was left out in {alone} frames; their results are those of the other views")
     for view, frames in moved.items():

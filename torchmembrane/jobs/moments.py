@@ -26,7 +26,8 @@ def moments(streams: Sequence[Iterator[TimedPicture[Image]]]) -> Iterator[list[T
     lost, the interval is the median of the latest `RECENT` intervals. Otherwise that view has no picture at this moment.
 
     Args:
-        streams: pictures of each view, in the order of time.
+        streams: pictures of each view, in the order of time. A picture whose time is earlier than that of its predecessor,
+            because a clock was set back, is a moment of its own.
 
     Yields:
         For each view its picture, or None.
@@ -60,9 +61,9 @@ class _Queue(Generic[Image]):
     @property
     def interval(self) -> float:
         """Interval from the next picture to the one after it, or the median of the latest intervals if that is shorter,
-        seconds."""
+        seconds; 0 if the clock is set back in between."""
         usual = median(self._intervals) if self._intervals else inf
-        return usual if self._after is None else min(usual, self._after.time - self.time)
+        return usual if self._after is None else min(usual, max(0.0, self._after.time - self.time))
 
     def taken(self) -> TimedPicture[Image] | None:
         """Remove and return the next picture."""
@@ -72,5 +73,5 @@ class _Queue(Generic[Image]):
 
     def _look_ahead(self) -> None:
         self._after = None if self.next is None else next(self._stream, None)
-        if self._after is not None:
+        if self._after is not None and self._after.time > self.time:
             self._intervals.append(self._after.time - self.time)

@@ -11,7 +11,7 @@ from ..errors import MembraneError
 from ..files.order import warn_of_file_times
 from ..track import Tracker
 from ..user_warnings import warn_user
-from .decode import Source, sources
+from .decode import Source, existing_files, files_of, source_file_of, sources
 from .inputs import Inputs, find_inputs, frame_name, of_first_view
 
 if TYPE_CHECKING:
@@ -50,6 +50,23 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
     return rest
 
 
+def rest_hash(arguments: list[str], inputs: Inputs) -> str:
+    """Return the content hash of the images of the rest state; "" for `first:N`, whose images are among the inputs.
+
+    Args:
+        arguments: as for `recording_rest`.
+        inputs: inputs of the call.
+
+    Raises:
+        MembraneError: an image is missing or cannot be read.
+    """
+    if not arguments or arguments[0].startswith(FIRST):
+        return ""
+    found = of_first_view(find_inputs(arguments), inputs.views, inputs.topics)
+    files = [existing_files(path, found.views) for path in found.images] + [files_of(path, found) for path in found.videos]
+    return source_file_of(*(file for each in files for file in each)).content_hash
+
+
 def _loaded(source: Source, reconstructor: "Reconstructor", said: str) -> Tensor:
     try:
         return source.load(reconstructor).image
@@ -61,8 +78,10 @@ def _loaded(source: Source, reconstructor: "Reconstructor", said: str) -> Tensor
 
 def _warn_of_contact(reconstructor: "Reconstructor", rest: Tensor, said: str) -> None:
     """Warn if the rest images show a press, compared with the sensor's rest image, or a drift that looks like a press."""
+    observer = reconstructor.observer
+    pixels, before = (observer.by_view(located[None]) for located in (rest, observer.measured_rest))
     with torch.no_grad():
-        result = reconstructor.from_pixels(reconstructor.observer.by_view(rest[None]))
+        result = reconstructor.from_pixels(pixels, rest_pixels=before[0])
     if Tracker(reconstructor).is_pressed(result):
         known = (
             f"of {float(result.force[0].norm()):.3g} {reconstructor.sensor.force_unit} "

@@ -1,9 +1,12 @@
 """The folder of a job's results: it keeps track of finished frames, and writes frames, figures and summary.csv."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
+from math import nan
 from pathlib import Path
 from types import TracebackType
+
+from numpy import isclose
 
 from ..files.atomic import PARTIAL
 from ..files.folder_lock import FolderLock, Shard
@@ -46,6 +49,7 @@ class ResultFolder:
         shard: part of the frames to reconstruct here.
         figures: whether every frame has a figure.
         report: function called with each message.
+        reading: function of a frame's name and time that returns its gauge reading, NaN without one.
 
     Attributes:
         finished: names of the frames that need not be reconstructed again.
@@ -54,14 +58,25 @@ class ResultFolder:
         MembraneError: on entering, if the folder belongs to another sensor or other settings, or another job is writing there.
     """
 
-    def __init__(self, path: Path, mesh: Mesh, inputs: Inputs, shard: Shard, figures: bool, report: Callable[[str], None]):
+    def __init__(
+        self,
+        path: Path,
+        mesh: Mesh,
+        inputs: Inputs,
+        shard: Shard,
+        figures: bool,
+        report: Callable[[str], None],
+        reading: Callable[[str, float], float] = lambda name, time: nan,
+    ):
         check_folder(path, mesh.sensor, mesh.settings)
         if mesh.format == "parquet":
             load_pyarrow()
         self.path, self.mesh, self.figures, self.report = path, mesh, figures, report
         self._files = {frame_name(image): image for image in inputs.images}
-        self._inputs, self._shard = inputs, shard
+        self._inputs, self._shard, self._reading = inputs, shard, reading
         self.finished: set[str] = set()
+        self._awaited: dict[str, Path] = {}  # frames of changed files that have not come again yet
+        self._unreadable: set[Path] = set()
 
     def __enter__(self) -> "ResultFolder":
         self._lock = FolderLock(self.path, self._shard)
@@ -83,13 +98,29 @@ class ResultFolder:
 
     def keep(self, outcome: Outcome) -> int:
         """Store a frame's result, or record that it has none; return its status."""
+        self._awaited.pop(outcome.name, None)
         if outcome.stored is None:
+            self._unreadable.add(outcome.file)
             self.frames.forget(outcome.name)
             self.summary.add_unreadable(outcome.name, outcome.file, outcome.reason)
         else:
             self.frames.write(outcome.name, outcome.stored)
             self.summary.add(outcome.name, outcome.stored)
         return outcome.status
+
+    def remove_outdated(self) -> None:
+        """Remove the results of frames that a changed file no longer contains; call this after the last frame.
+
+        They are kept if the file, or a picture in it, cannot be read.
+        """
+        gone = sorted((name for name, file in self._awaited.items() if file not in self._unreadable), key=in_order)
+        for name in gone:
+            self.frames.forget(name)
+            self.summary.remove(name)
+            if self.figures:
+                (self.path / f"{name}.png").unlink(missing_ok=True)
+        if gone:
+            self.report(f"{gone[0]}{_and_more(gone)}: removed, as the changed file does not contain this frame any more")
 
     def save(self) -> None:
         """Write the frames that have been buffered long enough."""
@@ -113,22 +144,36 @@ class ResultFolder:
                 self.finished.add(name)
         unreadable, holds = str(UNREADABLE), self._shard.holds
         self.summary.write(lambda row: not holds(row["name"]) or (row["status"] == unreadable and row["name"] not in origins))
-        self._judge({name: origins[name] for name in self.finished})
+        self._judge(origins)
 
     def _judge(self, origins: dict[str, SourceFile]) -> None:
-        """Remove frames whose images have changed from the finished frames, and report them."""
+        """Remove frames whose images or gauge readings have changed from the finished frames, and report them."""
 
         @cache
         def is_of(origin: SourceFile, file: Path) -> bool:
             return origin.is_of(*files_of(file, self._inputs))
 
-        files = {name: file for name in sorted(origins, key=in_order) if (file := self._file_of(name))}
-        changed = [name for name, file in files.items() if not is_of(origins[name]._replace(time=0.0), file)]
+        def is_changed(name: str, file: Path) -> bool:
+            return not is_of(origins[name]._replace(time=0.0, gauge=0.0), file)
+
+        def is_corrected(name: str) -> bool:
+            origin = origins[name]
+            return not isclose(self._reading(name, origin.time), origin.gauge, equal_nan=True)
+
+        given = {_named(path): path for path in (*self._inputs.images, *self._inputs.videos)}
+        sources = {name: file for name, origin in origins.items() if (file := given.get(_named(Path(origin.path))))}
+        self._awaited = {name: file for name, file in sources.items() if is_changed(name, file)}
+        files = {name: file for name in sorted(self.finished, key=in_order) if (file := self._file_of(name))}
+        changed = [name for name, file in files.items() if is_changed(name, file)]
         self.finished.difference_update(changed)
+        corrected = [name for name in files if name in self.finished and is_corrected(name)]
+        self.finished.difference_update(corrected)
         damaged = [path for path in self.frames.damaged if path.parent != self.path or self._file_of(path.stem)]
         unknown = [name for name in files if not origins[name].content_hash]
         if changed:
             self.report(f"{_listed([files[name] for name in changed])}: changed, done again")
+        if corrected:
+            self.report(f"{corrected[0]}{_and_more(corrected)}: the gauge reading has changed, done again")
         if damaged:
             self.report(f"{_listed(damaged)}: damaged, done again")
         if unknown:
@@ -141,5 +186,14 @@ class ResultFolder:
         return self._files.get(name) or self._inputs.video_of(name)
 
 
+def _named(path: Path) -> tuple[str, str]:
+    """Return what identifies the source of a frame among the inputs: the name of its frames, and that of the file."""
+    return frame_name(path), printable(path.name)
+
+
 def _listed(paths: list[Path]) -> str:
-    return f"{paths[0]}" + (f" and {len(paths) - 1} more" if paths[1:] else "")
+    return f"{paths[0]}{_and_more(paths)}"
+
+
+def _and_more(things: Sequence[object]) -> str:
+    return f" and {len(things) - 1} more" if things[1:] else ""

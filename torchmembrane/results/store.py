@@ -55,13 +55,21 @@ class Settings(NamedTuple):
     pressure: str = ""
     pressure_noise: float = 0.0
     fields: str = ""
+    rest_hash: str = ""
 
     @classmethod
     def from_reconstructor(
-        cls, reconstructor: ResultMaker, format: str, rest: str = "", pressure: str = "", fields: Sequence[str] = ()
+        cls,
+        reconstructor: ResultMaker,
+        format: str,
+        rest: str = "",
+        pressure: str = "",
+        fields: Sequence[str] = (),
+        rest_hash: str = "",
     ) -> "Settings":
         """Return the settings of a reconstructor's results. `rest`: source of the rest state if it is not the sensor's rest
-        image; `pressure`: file of the gauge's readings; `fields`: additional fields of the surface that frames contain."""
+        image, and `rest_hash` the content hash of its images; `pressure`: file of the gauge's readings; `fields`: additional
+        fields of the surface that frames contain."""
         estimator = reconstructor.estimator
         return cls(
             estimator=reconstructor.estimator_name,
@@ -76,6 +84,7 @@ class Settings(NamedTuple):
             pressure=pressure,
             pressure_noise=getattr(estimator.settings, "pressure_noise", 0.0) if pressure else 0.0,
             fields=" ".join(fields),
+            rest_hash=rest_hash,
         )
 
 
@@ -92,8 +101,8 @@ class Mesh(NamedTuple):
     image_size      [2]     int64, width and height, px
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
-    estimator, energy, element, format, volume, flow, smoothing, locator, rest, pressure, pressure_noise, fields   the
-                            `Settings`
+    estimator, energy, element, format, volume, flow, smoothing, locator, rest, pressure, pressure_noise, fields, rest_hash
+                            the `Settings`
     camera_in_tool  [3, 4]  rotation and translation from the camera's frame to the tool's, `p_tool = R p + t`; [0, 4] where the
                             sensor file has no `[tool]`; `tool` gives it as a `Pose`
     record          `[record]` of the sensor file as JSON: serial, calibrated, images, by, uncertainty; empty without
@@ -126,6 +135,7 @@ class Mesh(NamedTuple):
     pressure: str = ""
     pressure_noise: float = 0.0
     fields: str = ""
+    rest_hash: str = ""
     camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
     record: str = ""
     view_names: str = ""
@@ -271,7 +281,13 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
         other = f"{in_one_line(repr(mesh.name))} ({in_one_line(mesh.sensor[:12])}, here {sensor[:12]})"
         raise MembraneError(f"--out {folder}: holds results of another sensor, {other}; choose another folder")
     for option, before, now in zip(Settings._fields, mesh.settings, settings, strict=True):
-        if before != now:
+        if option == "rest_hash":  # earlier versions did not store it
+            if before and before != now:
+                raise MembraneError(
+                    f"--out {folder}: the images of --rest {settings.rest} have changed since its results were made; choose "
+                    "another folder"
+                )
+        elif before != now:
             held = in_one_line(before) if before else ""
             name, none = option.replace("_", "-"), ELSE.get(option, "of the sensor")
             remedy = f", or pass --{name} {held}" if held else f", or leave --{name} out"

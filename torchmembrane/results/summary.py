@@ -42,6 +42,7 @@ class Summary:
     def __init__(self, folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any]):
         self.path, self.mesh, self.write_lock = folder / SUMMARY, mesh, write_lock
         self.rows: dict[str, dict[str, str]] = {}
+        self.removed: set[str] = set()
 
     def add(self, name: str, stored: Stored) -> None:
         """Add the row of a stored frame."""
@@ -57,15 +58,21 @@ class Summary:
         """Add a row for a file from which no image could be read."""
         self._set(name, UNREADABLE, {"file": printable(str(file)), "status_text": f"unreadable: {reason}"})
 
+    def remove(self, name: str) -> None:
+        """Remove the row of a frame whose result has been removed."""
+        self.rows.pop(name, None)
+        self.removed.add(name)
+
     def write(self, kept: Callable[[dict[str, str]], bool] = lambda row: True) -> None:
         """Write the new rows, together with those of the existing file that `kept` selects, in name order."""
         with self.write_lock:
-            rows = {row["name"]: row for row in _rows(self.path) if kept(row)} | self.rows
+            earlier = {row["name"]: row for row in _rows(self.path) if kept(row) and row["name"] not in self.removed}
+            rows = earlier | self.rows
             lines = ({key: escaped(key, rows[name][key]) for key in NAMES} for name in sorted(rows, key=in_order))
             _write_table(self.path, NAMES, lines)
             columns = in_units(self.mesh.length_unit, self.mesh.force_unit)
             _write_table(self.path.with_name(DICTIONARY), Column._fields, (column._asdict() for column in columns))
-        self.rows = {}
+        self.rows, self.removed = {}, set()
 
     def _set(self, name: str, status: int, cells: Mapping[str, str]) -> None:
         known = {"name": name, "status": str(status), "length_unit": self.mesh.length_unit, "force_unit": self.mesh.force_unit}
