@@ -430,6 +430,13 @@ def test_dots_laid_out_for_a_wanted_pattern_are_seen_where_they_were_wanted(desi
         layout_for_pixels(design, np.array([[5.0, 5.0]]), ["small"])
 
 
+def test_dots_that_stand_off_the_surface_are_not_laid_out(design):
+    pins = replace(design, markers=replace(design.markers, height=2.0))
+    for lay_out in (lambda: pixel_lattice(pins, 20.0), lambda: layout_for_pixels(pins, np.array([[160.0, 120.0]]), ["small"])):
+        with pytest.raises(MembraneError, match="calibrate layout: height of the markers is 2.0; expected 0"):
+            lay_out()
+
+
 # from Python
 
 

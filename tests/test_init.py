@@ -265,6 +265,37 @@ def test_what_is_missing_or_too_much_is_named(tmp_path, capsys, arguments, said)
     assert said in error and len(error.splitlines()) == 1 and not (tmp_path / "sensor.toml").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("--radius 12 --rest {rest} --rim 9,9,0 --focal 385", "expected a positive number"),
+        ("--radius 12 --rest {rest} --rim 9,9,5 --distance 0", "the rim behind a pinhole"),
+        (
+            "--radius 12 --distance 15 --image-size 640,480 --view 120 --lens fisheye --views left right=25,0",
+            "right='25,0'; expected",
+        ),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused_in_words(tmp_path, capsys, arguments, said):
+    cv2.imwrite(str(tmp_path / "rest.png"), np.full((24, 32), 100, np.uint8))
+    command = ["init", str(tmp_path / "sensor.toml"), "--shape", "dome", *arguments.format(rest=tmp_path / "rest.png").split()]
+    try:
+        assert main(command) == 2
+    except SystemExit as error:
+        assert error.code == 2
+    assert said in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("away, code", [(0.0, 0), (40.0, 2)])
+def test_the_distance_of_an_outline_is_told_once(tmp_path, capsys, away, code):
+    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    points = np.stack([25 * np.cos(turn), 18 * np.sin(turn), np.full(40, away)], 1)
+    np.savetxt(tmp_path / "rim.csv", points, delimiter=",", header="x,y,z", comments="")
+    given = f"--outline {tmp_path / 'rim.csv'} --height 6 --distance 40 --image-size 640,480 --focal 620 --prestretch 1.1"
+    assert main(["init", str(tmp_path / "sensor.toml"), *given.split()]) == code
+    assert ("lie at z = 40; expected either z in the camera's frame" in capsys.readouterr().err) == (code == 2)
+
+
 @pytest.mark.parametrize("text", ["250000 Pa", "2500hPa", "2500 mbar", "250kPa", "2.5 bar", "36.259434 psi"])
 def test_a_pressure_is_the_same_in_all_of_its_units(text):
     assert pressure_in_hectopascal(text) == pytest.approx(2500.0, rel=1e-6)

@@ -97,6 +97,23 @@ def test_of_a_measured_force_counts_what_is_along_the_one_that_is_found():
         assert ratios == pytest.approx([ratio]) and magnitudes.ravel() == pytest.approx([2.0, 3.0])
 
 
+@pytest.mark.parametrize("degrees, refused", [(20, False), (60, True), (180, True)])
+def test_a_force_of_another_frame_or_the_reaction_is_refused(presses, degrees, refused):
+    """Of which only the part along the reconstructed force would count."""
+    pixels, forces = presses
+    reconstructor = Reconstructor(sensor(Material("neo_hookean", PRESTRETCH)), dtype=torch.float64)
+    seen = Presses(reconstructor, pixels - reconstructor.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))
+    turn, apart = np.radians(degrees), np.cross(forces[1], [1.0, 0.0, 0.0])
+    apart *= np.linalg.norm(forces[1]) / np.linalg.norm(apart)
+    forces = np.stack([forces[0], np.cos(turn) * forces[1] + np.sin(turn) * apart, [np.nan] * 3])
+    found = seen.modulus, np.log(PRESTRETCH), 0.05, KnownForces(forces)
+    if refused:
+        with pytest.raises(MembraneError, match="image 2: the given force points (5[5-9]|6[0-5]|17[0-9]|180) degrees away"):
+            found[0](*found[1:])
+    else:
+        assert found[0](*found[1:])[0] > 0
+
+
 def test_forces_that_scatter_leave_the_error_of_their_mean():
     """Ratios of measured to found forces, each known to a tenth: their own scatter where that is larger, else the tenth."""
     material, cavity = SimpleNamespace(modulus=0.4), SimpleNamespace(filling="liquid")

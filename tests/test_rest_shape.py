@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchmembrane import Camera, Sensor
+from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.accuracy.rest_shape import rest_shape
 from torchmembrane.cli.main import main
 from torchmembrane.cli.rest_words import rest_in_words
 from torchmembrane.presets.blown_up import Stated, blown_up, sheet_dots
+from torchmembrane.sensor.factories import cavity_filling
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.surface.membrane import Membrane
 
@@ -101,3 +102,47 @@ def test_check_does_not_praise_dots_that_were_placed_from_the_image(tmp_path, ca
     said = capsys.readouterr().out
     assert "does not tell whether the rest surface is right" in said and "px (rms" not in said
     assert "reconstructed: ok" not in said and "the gauge reads 2404 hPa" in said
+
+
+@pytest.fixture(scope="module")
+def flat(window):
+    """A flat square of 32 mm, 25 mm from the camera, of simple numbers, which sum to no pressure at all."""
+    x = (np.arange(17) - 8.0) * 2
+    surface = Surface("heightfield", {"x": x, "y": x, "z": np.full((17, 17), 25.0)})
+    positions = np.stack([*(a.ravel() for a in np.meshgrid(x[2:-2:2], x[2:-2:2])), np.full(49, 25.0)], 1)
+    markers, material = Markers("dots", positions=positions), Material("neo_hookean", 1.2, None, 0.3, 0.4)
+    return replace(window, surface=surface, membrane=surface.membrane((17, 17)), material=material, markers=markers)
+
+
+@pytest.mark.parametrize("prestretch", [1.0, 1.2])
+@pytest.mark.parametrize("modulus", [0.3, None])
+@pytest.mark.parametrize("gauge", [None, 0.0, 20.0])
+def test_a_membrane_without_a_pressure_is_told_without_one(flat, prestretch, modulus, gauge):
+    sensor = replace(flat, material=replace(flat.material, prestretch=prestretch, shear_modulus=modulus))
+    assert rest_shape(sensor).pressure == 0 and rest_shape(sensor).left_over < 1e-6
+    said = rest_in_words(sensor, gauge)
+    assert "no overpressure; forces of 0.0%" in said[0]
+    assert ("0 hPa at rest" in said[-1]) == (gauge is not None), said
+
+
+def test_a_gauge_that_reads_nothing_is_told(window):
+    assert "shape or prestretch is wrong, or the gauge is not connected" in rest_in_words(window, 0.0)[-1]
+
+
+@pytest.mark.parametrize("pressure, is_wrong", [(1013.0, False), (700.0, False), (12.0, True), (101.3, True), (101300.0, True)])
+def test_a_gas_that_leaves_no_pressure_of_the_surroundings_is_told(window, recwarn, pressure, is_wrong):
+    """A gauge's reading of 12 hPa in place of the absolute pressure, kPa or Pa in place of hPa."""
+    cavity_filling(replace(window, cavity=Cavity("gas", pressure)), window.membrane, warn=True)
+    said = [
+        str(warning.message)
+        for warning in recwarn
+        if "expected the gas' absolute pressure in hPa, about 1025" in str(warning.message)
+    ]
+    assert len(said) == is_wrong
+
+
+def test_a_gas_needs_a_volume(flat):
+    gas = replace(flat, cavity=Cavity("gas", 1013.0))
+    with pytest.raises(MembraneError, match=r"expected the volume of the gas, .*: add volume to \[cavity\]"):
+        cavity_filling(gas, gas.membrane)
+    assert cavity_filling(replace(gas, cavity=Cavity("gas", 1013.0, 2e4)), gas.membrane).gas[1] == 2e4

@@ -65,6 +65,7 @@ file = "dots.csv"
 rest_image = "rest.png"
 polarity = "dark"
 """
+PORTS = GOOD[GOOD.index("[[camera.ports]]") : GOOD.index("[camera.medium]")]
 CAP = 'shape = "spherical_cap"\nrim_radius = 12.0\nheight = 6.0\nbase_z = 8.0\n'
 GRID = 'shape = "grid"\nfile = "grid.npz"\n'
 FIELD = 'shape = "heightfield"\nfile = "field.npz"\n'
@@ -342,6 +343,7 @@ BAD_TEXTS = [
     (replaced('"pinhole"', '"ortho"'), '[camera] model = "ortho"; expected "pinhole" or "fisheye"'),
     (replaced("distance = 1.0", "distance = 0.6"), "[camera]", "ports[1].distance is 0.6; expected", "in order"),
     (replaced("index = 1.33", "index = 0.5"), "[camera]", "medium_index is 0.5"),
+    (replaced(PORTS, ""), "[camera.medium] index = 1.33; expected 1 or no such table without [[camera.ports]]"),
     (replaced("[[camera.ports]]\ndistance = 1.0", "[camera.port]\ndistance = 1.0"), "port is unknown", "'ports'"),
     (replaced('shape = "spherical_cap"', 'shape = "cone"'), '[membrane] shape = "cone"; expected "grid" or'),
     (replaced('shape = "spherical_cap"\n', ""), "[membrane] shape is missing"),

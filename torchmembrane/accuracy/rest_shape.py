@@ -14,6 +14,7 @@ from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 
 RAISED = 1.02  # factor of the height for the finite difference of the sheet's shape
+UNPRESSED = 1e-9  # overpressure over tension / size, below which it is a rounding error
 LINES = 17  # of the sheet's grid; its shape is then accurate to some thousandths of its height
 
 
@@ -41,9 +42,9 @@ class RestShape(NamedTuple):
     """The result of checking a rest surface.
 
     Attributes:
-        pressure: overpressure of the fluid according to the model, force / length^2.
-        left_over: rms of the residual force per area that tension and pressure do not balance, over the pressure; the model
-            balances it with a fixed load.
+        pressure: overpressure of the fluid according to the model, force / length^2; 0 for a flat or an unstretched membrane.
+        left_over: rms of the residual force per area that tension and pressure do not balance, over the pressure, or without a
+            pressure over tension / size; the model balances it with a fixed load.
         nearest: the nearest inflated sheet; None if the surface is such a sheet, or there is none in its rim.
     """
 
@@ -68,10 +69,13 @@ def rest_shape(sensor: Sensor) -> RestShape:
         (True, True)
     """
     membrane = sensor.membrane
-    p0, load = rest_balance(membrane, elastic_energy(sensor, membrane))
+    elasticity = elastic_energy(sensor, membrane)
+    p0, load = rest_balance(membrane, elasticity)
     load, area = load[membrane.free_vertices], membrane.rest_area[membrane.free_vertices]
-    left_over = float((load.square().sum(1) / area).sum() / area.sum()) ** 0.5 / abs(float(p0))
-    return RestShape(float(p0), left_over, _nearest(sensor))
+    left_over = float((load.square().sum(1) / area).sum() / area.sum()) ** 0.5
+    held = max(float(elasticity.tension), float(elasticity.c1 + elasticity.c2)) / membrane.size
+    pressure = float(p0) if abs(float(p0)) > UNPRESSED * held else 0.0
+    return RestShape(pressure, left_over / (abs(pressure) or held), _nearest(sensor))
 
 
 def _nearest(sensor: Sensor) -> NearestSheet | None:

@@ -62,13 +62,14 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
         Pixels `[D, 2]`, and the size of each dot, "small" or "large".
 
     Raises:
-        MembraneError: the pitch is too small.
+        MembraneError: the pitch is too small, or the sensor's markers stand off the surface.
 
     Example:
         >>> pixels, sizes = pixel_lattice(Sensor.from_file("examples/sensor.toml"), 60.0)
         >>> pixels.shape, sizes[:3]
         ((32, 2), ['large', 'small', 'large'])
     """
+    sensor.refuse_heights("calibrate layout")
     width, height = sensor.camera.image_size
     if not 4 <= pitch <= width + height:
         expected = f"4 px or more, so that dots are distinguishable, at most {width + height}"
@@ -104,8 +105,8 @@ def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> F
         The dots to be made.
 
     Raises:
-        MembraneError: the ray of a pixel misses the surface (the message names the first one), or there are more dots than a
-            sensor may list.
+        MembraneError: the ray of a pixel misses the surface (the message names the first one), there are more dots than a
+            sensor may list, or the sensor's markers stand off the surface.
 
     Example:
         >>> sensor = Sensor.from_file("examples/sensor.toml")
@@ -114,6 +115,7 @@ def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> F
         array([[320., 240.],
                [360., 240.]])
     """
+    sensor.refuse_heights("calibrate layout")
     wanted = aimed = np.asarray(pixels, float)
     right = wanted.ndim == 2 and wanted.shape[1] == 2
     expect(right, "calibrate layout: pixels", f"an array {list(wanted.shape)}", "[D, 2], u and v of each dot")

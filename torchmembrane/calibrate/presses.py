@@ -22,6 +22,7 @@ STRETCHES = np.geomspace(1.01, 2.0, 10)  # at larger prestretches the shape hard
 BETWEEN = 5  # number of prestretches tried around the one of lowest loss
 GAS_ROUNDS = 4
 MODULUS_SETTLED = 1e-3  # relative change of the modulus with a gas that changes forces by less than a thousandth
+LARGEST_ANGLE = 30.0  # degrees between a given and a reconstructed force; a mounting that is not quite straight makes less
 CONTINUED = 0.1  # time of a continuation from a neighbouring prestretch, over that of a solve from rest, measured
 
 
@@ -186,6 +187,8 @@ class Presses:
         modulus = self.reconstructor.sensor.material.modulus
         progress(0.0, "modulus from forces")
         self._refuse_unpressed(float(np.exp(log_stretch)), modulus, np.isfinite(forces).all(1))
+        if forces.shape[1] == 3:
+            self._refuse_other_directions(float(np.exp(log_stretch)), modulus, forces)
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
             ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
             modulus = float((weight * ratios).sum() * modulus)
@@ -213,6 +216,19 @@ class Presses:
             raise MembraneError(
                 f"calibrate material: image {i + 1} shows hardly any force, although a force is given for it; expected presses "
                 "that dent the membrane visibly: leave out the image, or its force"
+            )
+
+    def _refuse_other_directions(self, stretch: float, modulus: float, forces: np.ndarray) -> None:
+        """Raise an error if a known force `[B, 3]` points in another direction than the reconstructed one."""
+        found = _forces(self.explained(stretch, modulus))
+        lengths = np.linalg.norm(forces, axis=1) * np.linalg.norm(found, axis=1)
+        cosines = (forces * found).sum(1) / np.maximum(lengths, np.finfo(float).tiny)
+        for i in np.flatnonzero(cosines < np.cos(np.radians(LARGEST_ANGLE))):
+            angle = np.degrees(np.arccos(cosines[i].clip(-1, 1)))
+            raise MembraneError(
+                f"calibrate material: image {i + 1}: the given force points {angle:.0f} degrees away from the force that the "
+                f"image shows; expected at most {LARGEST_ANGLE:g}: give the force that acts on the membrane (not the reaction "
+                "on the body), in the camera's frame, or its magnitude alone"
             )
 
     def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """The work of `torchmembrane init`: from options to a sensor and its commented file."""
 
 from argparse import Namespace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from ..sensor.toml import default_grid
 from ..sensor.units import METRE
 from .choices import FROM_IMAGE
 
+IN_PLANE = 0.05  # mean z of a rim's points over its extent, up to which they count from its plane
 ROUND = 0.95  # shorter over longer half axis of a rim, from which on it is taken for a circle
 CIRCULAR = ("dome", "cap", "bubble")  # shapes with a rim that is a circle
 LENGTHS = ("radius", "height", "semi_axes", "length", "half_angle", "size", "corner")
@@ -106,13 +108,25 @@ def _sheet(arguments: Namespace, distance: float | None) -> BlownUp:
     """Return the sheet that is inflated in the rim that the arguments describe."""
     rim: dict[str, Any] = {"outline": arguments.shape}
     if arguments.outline is not None:
-        rim["outline"] = read_rim(arguments.outline)
+        rim["outline"] = points = read_rim(arguments.outline)
+        if distance is not None and points.shape[1] == 3:
+            _refuse_twice(points, distance, arguments.outline)
     else:
         rim |= {key: getattr(arguments, key) for key in ("size", "corner") if getattr(arguments, key) is not None}
     if distance is not None:
         rim["base_z"] = distance
     names = "height", "overpressure", "prestretch", "shear_modulus", "thickness"
     return blown_up(rim, arguments.unit, Stated(*(getattr(arguments, name) for name in names)))
+
+
+def _refuse_twice(points: np.ndarray, distance: float, path: Path) -> None:
+    """Refuse a distance of the rim's plane for points `[N, 3]` that are already at a distance from the camera."""
+    away, extent = float(points[:, 2].mean()), float(np.ptp(points[:, :2], axis=0).max())
+    if abs(away) > IN_PLANE * extent:
+        raise MembraneError(
+            f"init: --distance {distance:g}, but the points of {path} lie at z = {away:.4g}; expected either z in the camera's "
+            "frame and no --distance, or z about 0, from the rim's plane"
+        )
 
 
 def refuse_foreign(arguments: Namespace) -> None:
@@ -147,16 +161,16 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
         )
     focal = arguments.focal or (arguments.view and focal_of_view(arguments.lens, size[0], arguments.view))
     distance, centre = arguments.distance, arguments.centre or [(side - 1) / 2 for side in size]
-    if arguments.rim is not None:
-        u, v, pixels = arguments.rim
-        circle, centre = RimCircle(arguments.radius, pixels, arguments.lens), arguments.centre or [u, v]
-        distance = circle.distance(focal) if distance is None else distance
-        focal = focal or circle.focal(distance)
     if arguments.lens == "pinhole" and distance is not None and not distance > 0:
         raise MembraneError(
             f"init: --distance {distance:g}: the rim behind a pinhole, which sees nothing there; expected a positive distance, "
             "or --lens fisheye"
         )
+    if arguments.rim is not None:
+        u, v, pixels = arguments.rim
+        circle, centre = RimCircle(arguments.radius, pixels, arguments.lens), arguments.centre or [u, v]
+        distance = circle.distance(focal) if distance is None else distance
+        focal = focal or circle.focal(distance)
     camera = Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre, bits=arguments.bits)
     return Optics(camera, None if distance is None else float(f"{distance:.7g}"))
 

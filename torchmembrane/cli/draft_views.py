@@ -1,6 +1,6 @@
 """Several views in a drafted sensor: the approximate camera poses, refined with the rest images."""
 
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,7 +48,7 @@ def with_views(sensor: Sensor, arguments: Namespace) -> tuple[Sensor, list[str]]
     width, height = sensor.camera.image_size
     centre = arguments.centre or ((width - 1) / 2, (height - 1) / 2)
     lens = Camera(sensor.camera.model, sensor.camera.image_size, sensor.camera.focal.tolist(), centre, bits=arguments.bits)
-    views = [View(name, lens, looking_at(middle, np.array(vector(place)))) for name, place in places.items()]
+    views = [View(name, lens, looking_at(middle, np.array(_place(name, place)))) for name, place in places.items()]
     sensor = replace(sensor, views=(View(first, sensor.camera), *views))
     if not images:
         return sensor, [_seen_in_words(sensor, number) for number in range(1, len(sensor.views))]
@@ -61,6 +61,14 @@ def with_views(sensor: Sensor, arguments: Namespace) -> tuple[Sensor, list[str]]
             f"view {view.name!r} found at {place} {sensor.length_unit}: its dots lie {moved:.2f} px off where it sees them"
         )
     return sensor, said
+
+
+def _place(name: str, text: str) -> list[float]:
+    """Return the position of a view, written X,Y,Z."""
+    try:
+        return vector(text)
+    except ArgumentTypeError as error:
+        raise MembraneError(f"init: --views {name}={error}") from None
 
 
 def looking_at(point: np.ndarray, place: np.ndarray) -> ViewPose:

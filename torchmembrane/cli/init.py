@@ -40,9 +40,9 @@ and, if you like, a further column size, which is small or large.
 
 rectangle, ellipse and --outline are sheets that are stretched in a rim and inflated. Their shape is an equilibrium: it is
 solved from the rim, the prestretch, and --height or --overpressure or both. rim.csv contains points once around the rim: x,y
-from its middle, or x,y,z. For such a sheet, any three of height, overpressure, prestretch and shear modulus x thickness give
-the fourth. For the other shapes, any two of overpressure, prestretch and shear modulus x thickness give the third. If all are
-given and they contradict one another, the command says so.
+from its middle, or x,y,z in the camera's frame, then without --distance. For such a sheet, any three of height, overpressure,
+prestretch and shear modulus x thickness give the fourth. For the other shapes, any two of overpressure, prestretch and shear
+modulus x thickness give the third. If all are given and they contradict one another, the command says so.
 
 For several views (--views), --rest is the image of the first view, NAME_VIEW.png. The images of the other views lie beside it.
 The pose of each camera then follows from the dots in its image.
@@ -207,7 +207,10 @@ def _add_markers(add: Add) -> None:
 
 
 def _rim(text: str) -> list[float] | str:
-    return text if text == FROM_IMAGE else vector(text)
+    if text == FROM_IMAGE:
+        return text
+    u, v, radius = vector(text)
+    return [u, v, positive(f"{radius:g}")]
 
 
 def run(arguments: Namespace) -> int:

@@ -156,6 +156,10 @@ def _read_camera(table: Table, others: Sequence[str] = ()) -> Camera:
         part.allow(Port._fields)
     if medium:
         medium.allow(("index",))
+        if not ports and medium.number("index") != 1.0:
+            raise medium.refuse(
+                "index", "1 or no such table without [[camera.ports]]: light is refracted at the ports; add them"
+            )
     crop = table.whole_numbers("crop", 4) if "crop" in table else None
     binning = table.whole_pair("binning") if "binning" in table else [1, 1]
     with table.naming():
