@@ -103,12 +103,23 @@ def test_the_command_takes_the_files_of_each_view(model, tmp_path, capsys):
     assert "right (" in lacking and SourceFile.from_files(tmp_path / "press1_left.png").content_hash in lacking
     files = [tmp_path / f"press0_{name}.png" for name in SIZES]
     assert SourceFile.from_files(*files).content_hash in (out / "summary.csv").read_text().splitlines()[1]
-    assert main([str(model), str(files[1]), "--out", str(out)]) == 2
+    Image.fromarray(images(100, 10)[0][0]).save(tmp_path / "press.png")
+    assert main([str(model), str(tmp_path / "press.png"), "--out", str(out)]) == 2
     assert "expected images NAME_left, NAME_right of each frame" in capsys.readouterr().err
     for name in SIZES:
         (tmp_path / f"broken_{name}.png").write_bytes(b"no image")
     assert main([str(model), f"{tmp_path}/broken*.png", "--out", str(out)]) == 1
     assert "view left: " in (said := capsys.readouterr().err) and "view right: " in said
+
+
+def test_a_frame_may_lack_the_first_view_and_views_may_have_different_endings(model, tmp_path):
+    for (name, image), ending in zip(zip(SIZES, images(100, 10), strict=True), ("png", "bmp"), strict=True):
+        Image.fromarray(image[0]).save(tmp_path / f"both_{name}.{ending}")
+    Image.fromarray(images(100, 51)[1][0]).save(tmp_path / "alone_right.png")
+    assert main([str(model), f"{tmp_path}/*_*.*", "--out", str(tmp_path / "out")]) == 0
+    for name, height in (("both", 90 / 255), ("alone", np.nan)):  # this model needs the left image
+        found = np.load(tmp_path / "out" / f"{name}_left.npz")["vertices"]
+        np.testing.assert_allclose(found, np.full((9, 3), height), atol=1e-6)
 
 
 @pytest.mark.parametrize("latest", SIZES)

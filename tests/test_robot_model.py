@@ -78,3 +78,10 @@ def turned(axis, angle):
     rotation[a, a] = rotation[b, b] = np.cos(angle)
     rotation[a, b], rotation[b, a] = -sign * np.sin(angle), sign * np.sin(angle)
     return rotation
+
+
+@pytest.mark.parametrize("name, stem", [("left/finger 2", "left_finger_2"), ("..", "sensor"), ("Finger-1.b", "Finger-1.b")])
+def test_any_name_of_a_sensor_gives_files(tmp_path, name, stem):
+    write_robot_model(replace(tm.preset("fingertip"), name=name), tmp_path / "robot")
+    assert ElementTree.parse(tmp_path / "robot" / f"{stem}.urdf").getroot().get("name") == name
+    assert {file.name for file in tmp_path.rglob("*.xml")} == {f"{stem}.xml"}

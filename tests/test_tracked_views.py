@@ -44,6 +44,13 @@ def test_one_frame_of_every_view_is_taken(stream):
             tm.Tracker(reconstructor)(wrong)
 
 
+@pytest.mark.parametrize("form", [lambda a: a[..., None], lambda a: np.stack([a] * 3), lambda a: np.stack([a] * 3, -1)])
+def test_an_image_of_a_view_may_have_one_channel_or_colours_first_or_last(stream, form):
+    reconstructor, _, frames = stream
+    expected, found = (tm.Tracker(reconstructor)(frame) for frame in (frames[1], [form(image) for image in frames[1]]))
+    torch.testing.assert_close(found.vertices, expected.vertices, rtol=0, atol=1e-3)
+
+
 def test_a_view_that_moves_is_named_and_taken_for_rest(stream):
     """The right camera alone is knocked by 2 px: said once, by its name; `rezero` takes it out of the markers too."""
     reconstructor, (left, right), frames = stream

@@ -15,6 +15,9 @@ import torchmembrane as tm
 from torchmembrane.cli.main import main
 from torchmembrane.jobs.moments import TimedPicture, moments
 from torchmembrane.live import sources
+from torchmembrane.live.loop import LiveFrame
+from torchmembrane.live.recording import Recording
+from torchmembrane.live.streams import TrackedStream
 from torchmembrane.live.view_sources import moments_of_cameras
 from torchmembrane.sensor.views import View
 from torchmembrane.simulate import Simulator, Sphere
@@ -104,6 +107,56 @@ def test_videos_of_the_views_are_matched_by_their_times(recorded, tmp_path, caps
     (tmp_path / "press_right.mkv").unlink()
     assert command(path, tmp_path / "press_left.mkv", out=tmp_path / "other") == 2
     assert "no press_right.mkv beside it" in capsys.readouterr().err
+
+
+def test_images_of_the_views_may_have_different_endings(recorded, tmp_path, capsys):
+    path, frames, expected, _ = recorded
+    for view, image, ending in zip(VIEWS, frames[3], ("png", "tiff"), strict=True):
+        Image.fromarray(image).save(tmp_path / f"press_{view}.{ending}")
+    (tmp_path / "press_right.npz").touch()  # what else lies there
+    assert command(path, tmp_path / "press_left.png", out=tmp_path / "out") == 0
+    frame = tm.read_results(tmp_path / "out")["press_left"]
+    assert int(frame["status"]) == 0 and np.abs(frame["vertices"] - expected[3]).max() < 5e-3
+
+
+@pytest.mark.parametrize("lost", VIEWS)
+def test_a_frame_that_a_view_lacks_is_solved_by_the_other_whichever_it_is(recorded, tmp_path, capsys, lost):
+    path, frames, expected, _ = recorded
+    (tmp_path / "day").mkdir()
+    for number in (2, 3):
+        for view, image in zip(VIEWS, frames[number], strict=True):
+            if number == 3 or view != lost:
+                Image.fromarray(image).save(tmp_path / "day" / f"p{number}_{view}.png")
+    assert command(path, tmp_path / "day", out=tmp_path / "out") == 0
+    results = tm.read_results(tmp_path / "out")
+    assert results.names == ["p2_left", "p3_left"] and [int(frame["status"]) for frame in results] == [10, 0]
+    assert f"others': {lost}" in (tmp_path / "out" / "summary.csv").read_text()
+    (tmp_path / "day" / "p4.png").touch()
+    assert command(path, tmp_path / "day", out=tmp_path / "other") == 2
+    assert "p4.png: of no view; expected NAME_left, NAME_right of each frame" in capsys.readouterr().err
+
+
+def test_a_recording_of_several_cameras_is_read_back_and_shown_with_its_images(recorded, tmp_path, capsys):
+    """Colours of the right camera, of 12 bits, need a TIFF; it lacks the first moment."""
+    path, frames, expected, reconstructor = recorded
+    stream, folder = TrackedStream(reconstructor), tmp_path / "day"
+    with Recording(folder, stream.mesh, None, 12) as kept:
+        for number in range(1, 4):
+            left, right = frames[number][0], frames[number][1][..., None] * np.uint16(16) + np.arange(3, dtype=np.uint16)
+            given = [left, None if number == 1 else right]
+            kept.keep(LiveFrame(number, 1e9 + number, given, stream([left, frames[number][1]], float(number)), 0.01))
+    assert {file.suffix for file in (folder / "images").iterdir()} == {".png", ".tiff"}
+    assert command(path, folder / "images", out=tmp_path / "out") == 0
+    assert [int(frame["status"]) for frame in tm.read_results(tmp_path / "out")] == [10, 0, 0]
+    assert main(["view", str(folder), "--dataset", str(tmp_path / "data")]) == 0
+    names = {file.name for file in (tmp_path / "data" / "train").iterdir()}
+    assert names == {"metadata.parquet", *(f"00000{number}.png" for number in range(1, 4))}
+    (tmp_path / "others").mkdir()
+    Image.fromarray(frames[1][0]).save(tmp_path / "others" / "away.png")
+    capsys.readouterr()
+    options = ["--images", str(tmp_path / "others"), "--sheet", str(tmp_path / "sheet.png")]
+    assert main(["view", str(folder), *options]) == 0
+    assert "no image has the name of a frame" in capsys.readouterr().err
 
 
 def test_an_image_that_a_view_lacks_is_said_and_taken_when_it_is_there(recorded, tmp_path, capsys):

@@ -266,12 +266,18 @@ class Tracker:
         return motion[0, view], r.sensor.views[view].name
 
     def _one(self, frame: Any) -> Tensor:
-        width, height = self.reconstructor.image_size
-        is_colour = not self.reconstructor.sensor.views_apart and np.shape(frame) == (3, height, width)
-        images = self.reconstructor.grey(frame[None] if is_colour else frame)  # else read as three grey frames
+        apart, sizes = self.reconstructor.sensor.views_apart, self.reconstructor.camera.image_sizes
+        if apart and isinstance(frame, list | tuple) and len(frame) == len(sizes):
+            frame = [_as_frames(image, size) for image, size in zip(frame, sizes, strict=True)]
+        images = self.reconstructor.grey(frame if apart else _as_frames(frame, self.reconstructor.image_size))
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
+
+
+def _as_frames(image: Any, size: tuple[int, int]) -> Any:
+    """Return one colour image `[3, H, W]`, which would be read as three grey frames, as `[1, 3, H, W]`; `size`: W and H."""
+    return image[None] if np.shape(image) == (3, *size[::-1]) else image
 
 
 def has_contact(result: Reconstruction) -> bool:

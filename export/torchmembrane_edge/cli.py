@@ -17,15 +17,13 @@ import numpy as np
 
 from . import results
 from .errors import EdgeError, printable
-from .images import Frame, frame_name, frames, numbered, pictures, view_frames
+from .images import SUFFIXES, Frame, frame_name, frames, numbered, pictures, view_frames
 from .session import MOST_THREADS, Session, model_file
 from .summary import UNREADABLE, Summary
 from .summary_row import AXES, CONTACTS, numbers
 from .view_status import status_in_words
 
 FINISHED = (0, 3, 7, 8, 9, 10)  # ok; not converged, unexplained, partly hidden, out of range, a view left out: it is kept
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
-"""File extensions of the images that are taken from a folder."""
 OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
 NUMBER = re.compile("_[0-9]{6,12}$")
 """Number of a picture, at the end of a frame's name."""
@@ -190,19 +188,23 @@ def _frames(path: Path, session: Session) -> Iterator[Frame]:
 
 
 def first_views(paths: list[Path], views: Sequence[str]) -> list[Path]:
-    """Return the first view's files among those of all `views`, NAME_VIEW; all paths if the views have no files of their own.
+    """Return the first view's path for each NAME among the files NAME_VIEW of all `views`, whether or not it exists; all paths
+    if the views have no files of their own.
 
     Raises:
-        EdgeError: a file belongs to no view, or the first view's file beside it is missing.
+        EdgeError: a file belongs to no view.
     """
     if not views:
         return paths
-    firsts = [path for path in paths if path.stem.endswith(f"_{views[0]}")]
-    names = {path.stem.removesuffix(views[0]) for path in firsts}
+    firsts = {}
     for path in paths:
-        if not any(path.stem.endswith(f"_{view}") and path.stem.removesuffix(view) in names for view in views):
+        view = max((view for view in views if path.stem.endswith(f"_{view}")), key=len, default=None)
+        if view is None:
             raise EdgeError(f"{printable(path)}: expected images NAME_{', NAME_'.join(views)} of each frame")
-    return firsts
+        frame = path.with_name(path.stem.removesuffix(view))
+        if frame not in firsts or view == views[0]:
+            firsts[frame] = path.with_name(f"{frame.name}{views[0]}{path.suffix}")
+    return list(firsts.values())
 
 
 def _kept(session: Session, frame: Frame, result: dict | None, seconds: float, summary: Summary) -> int:

@@ -18,6 +18,8 @@ from .errors import EdgeError, in_one_line, printable
 from .session import grey
 from .timestamps import time_in
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
+"""File extensions of the images that are taken from a folder."""
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "PPM")
 MOST_BYTES = 2**28
 LONGEST_NAME = 251
@@ -98,7 +100,7 @@ def view_frames(path: Path, views: Sequence[str], sizes: Sequence[tuple[int, int
     ending = f"_{views[0]}"
     if not path.stem.endswith(ending):
         raise EdgeError(f"{printable(path)}: expected the first view's image, NAME{ending}{path.suffix}, beside the others'")
-    files = [path.with_name(f"{path.stem.removesuffix(ending)}_{view}{path.suffix}") for view in views]
+    files = [_existing(path.with_name(f"{path.stem.removesuffix(ending)}_{view}{path.suffix}")) for view in views]
     for each in zip_longest(*(frames(file, size, bits) for file, size in zip(files, sizes, strict=True))):
         shown = [frame for frame in each if frame is not None and frame.image is not None]
         lacking = {
@@ -117,6 +119,12 @@ def view_frames(path: Path, views: Sequence[str], sizes: Sequence[tuple[int, int
         ]
         origin = {**shown[0].origin, "path": printable(path), **_joined([file for file in files if file.is_file()])}
         yield Frame(_of_first(path, shown[0]), path, images, origin=origin, lacking=lacking)
+
+
+def _existing(path: Path) -> Path:
+    """Return the path; if there is no such file, the only image of this name with another extension."""
+    others = [] if path.exists() else [other for suffix in SUFFIXES if (other := path.with_suffix(suffix)).is_file()]
+    return others[0] if len(others) == 1 else path
 
 
 def _of_first(path: Path, frame: Frame) -> str:

@@ -95,10 +95,11 @@ def run(arguments: Namespace) -> int:
     frame = None if reconstructor is None else rest_frame(reconstructor)
     print("\n".join([*described(sensor, reconstructor, frame), *rest_in_words(sensor, arguments.overpressure)]), flush=True)
     if arguments.robot:
-        from ..integrations.robot_model import write_robot_model
+        from ..integrations.robot_model import file_stem, write_robot_model
 
         folder = write_robot_model(sensor, arguments.robot)
-        print(f"{sensor.name}.urdf, {sensor.name}.xml (MJCF) and their meshes written to {folder}", flush=True)
+        stem = file_stem(sensor)
+        print(f"{stem}.urdf, {stem}.xml (MJCF) and their meshes written to {folder}", flush=True)
         _write_contact(sensor, folder)
     finished = _finished(sensor, arguments) if arguments.accuracy and not problem else None
     sheet = _sheet(sensor, arguments, finished) if finished else None

@@ -20,13 +20,16 @@ class FrameImages:
     """The images of frames, by name.
 
     Args:
-        files: the existing image files, by frame name.
+        files: the existing image files, by frame name; for several views, NAME_VIEW of the first view also
+            stands for NAME, the name of the frame in a recording.
         mesh: mesh of the results, which gives the image size and the part that the first view sees.
         bits: bit depth of the camera, if 16-bit files are known to use fewer bits.
     """
 
     def __init__(self, files: Mapping[str, Path], mesh: "Mesh", bits: int | None = None):
-        self.files, self.mesh, self.bits = files, mesh, bits
+        first = f"_{mesh.view_names.partition(' ')[0]}"
+        bare = {name.removesuffix(first): path for name, path in files.items() if mesh.view_names and name.endswith(first)}
+        self.files, self.mesh, self.bits = bare | dict(files), mesh, bits
 
     def named(self, name: str) -> "np.ndarray | None":
         """Return grey values `[height, width]` in 0..1, for several views those of the first; None if there is no image."""
@@ -39,8 +42,9 @@ class FrameImages:
 
 def images_in(folder: Path) -> dict[str, Path]:
     """Return the image files of a folder by the names of their frames; empty if there is no such folder."""
+    from ..files.images import IMAGES
     from ..files.system_files import is_hidden
-    from ..jobs.inputs import IMAGES, frame_name
+    from ..jobs.inputs import frame_name
 
     found = folder.iterdir() if folder.is_dir() else ()
     return {frame_name(path): path for path in found if path.suffix.lower() in IMAGES and not is_hidden(path)}

@@ -73,6 +73,7 @@ def run(arguments: Namespace) -> int:
     from ..files.order import warn_of_times
     from ..live.recording import times_of
     from ..results.read import read_results
+    from ..user_warnings import warn_user
 
     rerun, folders = wants_rerun(arguments), arguments.result
     others = arguments.out, arguments.video_out, arguments.sheet, arguments.save, arguments.ply, arguments.surface
@@ -89,6 +90,8 @@ def run(arguments: Namespace) -> int:
     warn_of_times((name, times[name]) for name in results.names if name in times)
     found = images_in(arguments.images or arguments.result / "images")
     images = FrameImages(found, results.mesh)
+    if found and not any(name in images.files for name in results.names):
+        warn_user(f"{next(iter(found.values())).parent}: no image has the name of a frame; the frames are shown without images")
     if arguments.sheet is not None:
         draw_sheet(results, images, arguments.sheet)
     if arguments.video_out is not None:
@@ -96,7 +99,7 @@ def run(arguments: Namespace) -> int:
     if arguments.dataset is not None:
         from ..results.data_set import write_data_set
 
-        write_data_set(results, arguments.dataset, found, times)
+        write_data_set(results, arguments.dataset, images.files, times)
         print(f"{len(results)} frames in {arguments.dataset}")
     if rerun:
         _show(results, images, times, arguments.save)

@@ -19,6 +19,9 @@ from .tiff import refuse_damaged_page
 
 MOST_IMAGE_BYTES, MOST_STACK_BYTES = 2**28, 2**32
 """Largest size in bytes of an image file, and of a multi-page TIFF, whose pages are read one by one."""
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".gif")
+"""Endings of the files that are taken from a folder, and of those that are read as videos."""
 MOST_PICTURES = 2**17
 """Largest number of pictures in a file."""
 GREY = (0.299, 0.587, 0.114)

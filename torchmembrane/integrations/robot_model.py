@@ -1,5 +1,6 @@
 """A sensor as a robot part for simulators: URDF and MJCF with meshes of the rest membrane and of its rim."""
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -43,15 +44,27 @@ def write_robot_model(sensor: Sensor, folder: str | Path) -> Path:
         ...     sorted(path.name for path in write_robot_model(preset("fingertip"), folder).iterdir())
         ['fingertip.urdf', 'fingertip.xml', 'membrane.stl', 'rim.stl']
     """
-    folder, name = make_folder(folder), sensor.name
+    folder, name = make_folder(folder), file_stem(sensor)
     pose = sensor.tool or Pose(np.eye(3), np.zeros(3))
     rotation, place = pose.rotation, pose.translation / METRE[sensor.length_unit]
     meshes = {"membrane": closed_membrane(sensor), "rim": rim_tube(sensor)}
     for mesh, (vertices, triangles) in meshes.items():
         write_bytes(folder / f"{mesh}.stl", stl(vertices / METRE[sensor.length_unit] @ rotation.T + place, triangles))
-    write_text(folder / f"{name}.urdf", _urdf(name, list(meshes), rotation, place))
+    write_text(folder / f"{name}.urdf", _urdf(sensor.name, list(meshes), rotation, place))
     write_text(folder / f"{name}.xml", _mjcf(sensor, list(meshes), rotation @ OPTICAL_TO_GRAPHICS, place))
     return folder
+
+
+def file_stem(sensor: Sensor) -> str:
+    """Return the sensor's name with `_` for characters that a file name may not contain.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from torchmembrane import preset
+        >>> file_stem(replace(preset("fingertip"), name="left/finger 2"))
+        'left_finger_2'
+    """
+    return re.sub(r"[^\w.-]", "_", sensor.name).lstrip(".") or "sensor"
 
 
 def closed_membrane(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:

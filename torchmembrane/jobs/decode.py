@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
 DECODERS = 4
+CUT = 1.0
+"""Time of the first picture of a video, s, above which it has been cut from a longer one."""
 LONGEST_NAME = 251
 """Largest length of a frame name in bytes, such that a file NAME.npz can exist."""
 
@@ -188,25 +190,25 @@ def _pictures(
 ) -> Iterator[Picture]:
     """Yield the pictures of a file of several.
 
-    In a bag, the time is that of the header, or else of the reception; in a video, it counts from the first picture, whose
-    absolute time the file name may give. `keeps_clock`: in a video without a time in its name, keep the times of the file
-    instead, which the videos of several views may share.
+    In a bag, the time is that of the header, or else of the reception; in a video, it counts from the beginning, whose absolute
+    time the file name may give. A video cut from a longer one, whose pictures keep their times, begins with the first picture.
+    `keeps_clock`: unless the name gives a time, keep the times of the file, which the videos of several views may share.
     """
     if is_bag(path):
         for each in messages(path, image_topic(path, topic)[0]):
             yield Picture(partial(_bag_image, each.message, size, bits), each.time)
         return
     of_stack, begun = picture_count(path, 1) > 0, time_in(path.stem)
-    first = 0.0 if keeps_clock and isnan(begun) else nan
+    first = 0.0 if keeps_clock and isnan(begun) else None
     begun = 0.0 if isnan(begun) else begun
     for picture in stack_images(path, size, bits) if of_stack else video_pictures(path, size):
         if isinstance(picture, MembraneError):
             yield Picture(partial(_refuse, str(picture)))
         else:
             time = getattr(picture, "time", None)  # an array has none
-            if time is not None and isnan(first):
-                first = time  # cut videos may keep the times of the whole one
-            yield Picture(partial(_image, picture, bits), nan if time is None else begun + time - first)
+            if time is not None and first is None:
+                first = time if time > CUT else 0.0
+            yield Picture(partial(_image, picture, bits), nan if time is None else begun + time - (first or 0.0))
 
 
 def _pictures_of_views(path: Path, inputs: Inputs, views: Sequence[View]) -> Iterator[Picture]:

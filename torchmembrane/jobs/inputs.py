@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
-from ..files.images import picture_count
+from ..files.images import IMAGES, VIDEOS, picture_count
 from ..files.order import in_order
 from ..files.provenance import printable
 from ..files.system_files import is_hidden, is_of_system
@@ -19,8 +19,6 @@ from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..results.store import MESH
 from ..sensor.view_images import view_files
 
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".gif")
 PICTURE = re.compile("[0-9]{6}|[1-9][0-9]{6,}")
 """Number of a picture in a frame's name, as `picture_name` writes it."""
 
@@ -164,7 +162,7 @@ def without_rest(inputs: Inputs, arguments: Iterable[str | Path], files: Iterabl
 
 def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = ()) -> Inputs:
     """Reduce inputs to one image or video per frame or recording: for views with images of their own, NAME_VIEW.png or
-    NAME_VIEW.mp4, those of the first view are kept.
+    NAME_VIEW.mp4, that of the first view stands for all. If the first view lacks an image, its path is given nevertheless.
 
     Args:
         inputs: inputs as returned by `find_inputs`.
@@ -172,8 +170,7 @@ def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = 
         topics: image topics of these views in bags.
 
     Raises:
-        MembraneError: a file belongs to no view, a frame lacks the image of the first view, a recording lacks the video of a
-            view, or a bag is given without topics.
+        MembraneError: a file belongs to no view, a recording lacks the video of a view, or a bag is given without topics.
 
     Example:
         >>> both = Inputs([Path("press_left.png"), Path("press_right.png")], [])
@@ -188,21 +185,27 @@ def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = 
     bags = inputs.bags
     images, videos = _firsts(inputs.images, views), _firsts([path for path in inputs.videos if path not in bags], views)
     for path in videos:
-        if missing := [file for file in view_files(path, views) if not file.exists()]:
-            raise MembraneError(f"{path}: no {missing[0].name} beside it; expected a video of each view, of the same recording")
+        files = view_files(path, views)
+        if missing := [file for file in files if not file.exists()]:
+            there = next(file for file in files if file.exists())
+            raise MembraneError(
+                f"{there}: no {missing[0].name} beside it; expected a video of each view, of the same recording"
+            )
     kept = [path for path in inputs.videos if path in bags or path in videos]
     return inputs._replace(images=images, videos=kept, views=views, topics=topics)
 
 
 def _firsts(paths: list[Path], views: Sequence[str]) -> list[Path]:
-    """Return the first view's files among the files of all views."""
-    firsts = [path for path in paths if path.stem.endswith(f"_{views[0]}")]
-    names = {path.stem.removesuffix(views[0]) for path in firsts}
+    """Return the first view's path for each NAME among the files NAME_VIEW of all views."""
+    firsts: dict[Path, Path] = {}
     for path in paths:
-        stem = next((path.stem.removesuffix(view) for view in views if path.stem.endswith(f"_{view}")), None)
-        if stem not in names:
-            raise MembraneError(f"{path}: of no view, or of none of the frames; expected NAME_{', NAME_'.join(views)} of each")
-    return firsts
+        view = max((view for view in views if path.stem.endswith(f"_{view}")), key=len, default=None)
+        if view is None:
+            raise MembraneError(f"{path}: of no view; expected NAME_{', NAME_'.join(views)} of each frame")
+        frame = path.with_name(path.stem.removesuffix(view))
+        if frame not in firsts or view == views[0]:
+            firsts[frame] = path.with_name(f"{frame.name}{views[0]}{path.suffix}")
+    return list(firsts.values())
 
 
 def single_images(inputs: Inputs) -> list[Path]:

@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Iterator
+from itertools import repeat
 from pathlib import Path
 from types import TracebackType
 
@@ -37,14 +38,14 @@ class Recording:
     Args:
         folder: new or empty folder.
         mesh: data that all frames share.
-        bits: bit depth of the camera, if 16-bit values use fewer bits.
+        bits: bit depth of the camera, if 16-bit values use fewer bits; for views with images of their own, one for each.
 
     Raises:
         MembraneError: the folder is not empty; from `keep` and at the end of the block: the folder cannot be written to. If the
             block ends with another error, this is a warning instead.
     """
 
-    def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
+    def __init__(self, folder: Path, mesh: Mesh, *bits: int | None):
         if folder.exists() and (not folder.is_dir() or not all(map(is_of_system, folder.iterdir()))):
             raise MembraneError(f"--record {folder}: is not empty; expected a new folder for each recording")
         self.folder, self.bits, self.views = folder, bits, mesh.view_names.split()
@@ -84,11 +85,11 @@ class Recording:
         """Write the frame's image files and yield their paths."""
         path = self.folder / IMAGES
         if isinstance(seen.image, np.ndarray):
-            yield write_as_taken(path / seen.name, seen.image, self.bits)
+            yield write_as_taken(path / seen.name, seen.image, *self.bits)
             return
-        for view, image in zip(self.views, seen.image, strict=True):
+        for view, image, bits in zip(self.views, seen.image, self.bits or repeat(None), strict=False):
             if image is not None:
-                yield write_as_taken(path / f"{seen.name}_{view}", image, self.bits)
+                yield write_as_taken(path / f"{seen.name}_{view}", image, bits)
 
 
 def times_of(folder: Path) -> dict[str, float]:

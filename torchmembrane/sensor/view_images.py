@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..files.grayscale import Channels, to_grayscale_batch
-from ..files.images import read_image
+from ..files.images import IMAGES, VIDEOS, read_image
 from .views import View
 
 
@@ -97,7 +97,8 @@ def view_files(path: Path, names: Sequence[str]) -> list[Path]:
     """Return the paths of the images of all views of one frame.
 
     Args:
-        path: path of the first view's image, `NAME_VIEW.ENDING`; the images of the other views differ in `VIEW` only.
+        path: path of the first view's image, `NAME_VIEW.ENDING`; the images of the other views differ in `VIEW`. A view whose
+            file does not exist has the file with another ending, if there is exactly one.
         names: names of the views that have images of their own; empty for one view, or if views are regions of one image.
 
     Raises:
@@ -116,7 +117,15 @@ def view_files(path: Path, names: Sequence[str]) -> list[Path]:
             "images of the other views beside it"
         )
     stem = path.stem.removesuffix(first)
-    return [path.with_name(f"{stem}_{name}{path.suffix}") for name in names]
+    return [_existing(path.with_name(f"{stem}_{name}{path.suffix}")) for name in names]
+
+
+def _existing(path: Path) -> Path:
+    """Return the path; if there is no such file, the only image or video of this name with another ending."""
+    if path.exists() or not path.parent.is_dir():
+        return path
+    others = [other for ending in (*IMAGES, *VIDEOS) if (other := path.with_suffix(ending)).is_file()]
+    return others[0] if len(others) == 1 else path
 
 
 def first_view_image(grey: Tensor, views: Sequence[View]) -> Tensor:
@@ -136,4 +145,4 @@ def first_view_picture(picture: np.ndarray | list[np.ndarray | None], views: Seq
 
 def _as_batch(images: Any) -> Any:
     """Add a channel axis to frames `[B, H, W]`, so that three grey frames are not mistaken for one colour image."""
-    return images[:, None] if images.ndim == 3 and images.shape[-1] != 3 else images
+    return images[:, None] if images.ndim == 3 and images.shape[-1] not in (1, 3) else images
