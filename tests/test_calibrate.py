@@ -240,6 +240,23 @@ def test_ports_are_found_from_images_in_air_and_in_the_medium():
     assert np.allclose([*found.camera.ports[0], float(found.camera.medium_index)], found.fit.values[:4])
 
 
+@pytest.mark.parametrize(
+    "pitch, exchanged, said",
+    [
+        (2.0, True, "in air and in the medium are not exchanged"),
+        (0.2, False, "in the sensor's length unit"),
+        (20.0, False, "which scales"),
+    ],
+)
+def test_ports_from_a_wrong_pitch_or_exchanged_images_are_refused(pitch, exchanged, said):
+    """Of a pitch in cm the camera that fits best sees the points elsewhere; one ten times too large makes all lengths so."""
+    rng = np.random.default_rng(1)
+    pixels = np.concatenate([exact_views(ported(PORT, air=air), 3, rng) for air in (True, False)])
+    board = DotBoard(DOTS.columns, DOTS.rows, pitch * DOTS.pitch / 2.0)
+    with pytest.raises(MembraneError, match=said):
+        ports_from_views(ported(GUESS), board, Views(pixels, (np.arange(6) >= 3) ^ exchanged))
+
+
 def test_in_the_medium_thickness_and_index_are_not_identifiable():
     rng = np.random.default_rng(2)
     found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 3, rng), np.ones(3, bool)))

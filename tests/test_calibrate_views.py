@@ -163,16 +163,18 @@ def test_a_mirror_shows_a_board_of_dots_reversed():
         find_target(mirrored, DOTS)
 
 
-def test_ports_of_one_view(tmp_path):
-    """Those of the named view change, the other camera's stay."""
+def test_ports_of_one_view(tmp_path, capsys):
+    """Those of the named view change, the other camera's stay; images that are named after the other one are left out."""
     lens, port = ("pinhole", (320, 240), (150.0, 150.0), (160.0, 120.0)), [(4.0, 3.0, 1.49)]
     guess = tm.Camera(*lens, ports=[(4.3, 3.0, 1.49)], medium_index=1.33)
     path = replace(cap(View("right", guess, POSES["right"]), camera=guess), name="ported").to_file(tmp_path / "design.toml")
     for number, image in enumerate(boards(tm.Camera(*lens, ports=port, medium_index=1.33), DOTS, 3, (13, 17))):
-        Image.fromarray(image).save(tmp_path / f"{number}.png")
-    given = [str(path), "--medium", f"{tmp_path}/?.png", "--dots", "11,8", "--pitch", "2.4", "--out", str(tmp_path / "out")]
+        Image.fromarray(image).save(tmp_path / f"{number}_right.png")
+        Image.fromarray(image[:, ::-1]).save(tmp_path / f"{number}_left.png")
+    given = [str(path), "--medium", f"{tmp_path}/?_*.png", "--dots", "11,8", "--pitch", "2.4", "--out", str(tmp_path / "out")]
     assert (
         main(["calibrate", "ports", *given, "--view", "right", "--held", "port_thickness", "port_index", "medium_index"]) == 0
     )
+    assert "3 images left out, as their names are those of other views than 'right'" in capsys.readouterr().out
     left, right = Sensor.from_file(tmp_path / "out" / "sensor.toml").views
     assert left.camera.ports[0].distance == 4.3 and abs(right.camera.ports[0].distance - 4.0) < 0.1

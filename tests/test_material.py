@@ -12,7 +12,7 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.calibrate.explained import _log_stretch
 from torchmembrane.calibrate.known_modulus import KnownForces
-from torchmembrane.calibrate.material import material_from_pixels
+from torchmembrane.calibrate.material import material_from_images, material_from_pixels
 from torchmembrane.calibrate.presses import STRETCHES, Presses
 from torchmembrane.calibrate.report import Report
 from torchmembrane.camera.model import Camera
@@ -155,6 +155,28 @@ def test_a_report_says_how_far_points_are_off_on_either_side():
     none, off = np.zeros(0), np.array([[0.3, 0.0], [0.0, -0.5]])
     report = Report("lens", [], [], none, none, none, np.zeros((0, 0)), off, off, 0.1, [])
     assert report.lines == ["lens", "  residuals: 2 points, 0.292 px rms, at most 0.500 px"]
+
+
+BAD_FORCES = {
+    "magnitudes without an axis": (np.ones(2), None, r"forces is 'an array \[2\]'; expected \[2, 3\] or \[2, 1\]"),
+    "of more images": (np.ones((3, 1)), None, r"forces is 'an array \[3, 1\]'"),
+    "all unknown": (np.full((2, 3), np.nan), None, "NaN for all images"),
+    "none": (np.array([[1.0], [0.0]]), None, "0 N for an image"),
+    "other deviations": (np.ones((2, 1)), np.ones(3), r"deviations of forces is 'an array \[3\]'; expected \[2\]"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_FORCES)
+def test_forces_of_another_shape_are_refused_before_the_work(kind):
+    forces, deviations, said = BAD_FORCES[kind]
+    with pytest.raises(MembraneError, match=said):
+        material_from_images(sensor(Material("neo_hookean", 1.5)), torch.zeros(2, 1, 480, 640), KnownForces(forces, deviations))
+
+
+@pytest.mark.parametrize("overpressure", [0.0, -12.0, float("nan")])
+def test_a_gauge_at_rest_that_is_no_overpressure_is_refused_before_the_work(overpressure):
+    with pytest.raises(MembraneError, match="expected a positive reading at rest, inside minus outside"):
+        material_from_images(sensor(Material("neo_hookean", 1.5)), torch.zeros(2, 1, 480, 640), overpressure=overpressure)
 
 
 def test_rest_tells_no_prestretch():

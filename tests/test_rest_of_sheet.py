@@ -97,3 +97,19 @@ def test_an_overpressure_of_another_shape_is_refused():
     sensor = Sensor.from_file("examples/sensor.toml")
     with pytest.raises(MembraneError, match="expected an inflated surface"):
         rest_from_image(sensor, sensor.markers.rest_image, 12.0)
+
+
+@pytest.mark.parametrize(
+    "reading, said", [(-44.0, "expected a positive reading"), (1057.0, "expected the same to a few per cent")]
+)
+def test_a_gauge_that_contradicts_the_modulus_is_refused(photograph, reading, said):
+    """Such as the absolute pressure."""
+    with pytest.raises(MembraneError, match=said):
+        rest_from_image(window(5.8, 1.1), photograph[0], reading)
+
+
+def test_a_gauge_that_reads_all_of_a_gas_pressure_is_refused(photograph):
+    unknown = window(5.8, 1.1)
+    material, cavity = replace(unknown.material, shear_modulus=None), Cavity("gas", 1057.0)
+    with pytest.raises(MembraneError, match="subtract the atmosphere's pressure"):
+        rest_from_image(replace(unknown, material=material, cavity=cavity), photograph[0], 1056.0)

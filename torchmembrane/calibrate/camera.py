@@ -11,7 +11,7 @@ from torch.func import functional_call, jacfwd, vmap
 from ..camera.model import Camera
 from ..camera.targets import Checkerboard, DotBoard
 from ..errors import MembraneError, check_arguments
-from .fit import Fit, fit, outliers, outline_centres, rotations
+from .fit import LARGEST_NOISE, Fit, fit, outliers, outline_centres, rotations
 from .poses import lens_and_poses, port_pose
 
 LENS = ("focal", "centre", "distortion")
@@ -21,6 +21,7 @@ DESIGN = {"port_distance": 0.2, "port_thickness": 0.2, "port_index": 0.1, "mediu
 """Relative standard deviation of the sensor file's values: values that views do not determine stay near these."""
 LOCATION_NOISE = 0.05  # px, initial guess of the noise of a point found in an image
 ROUNDS = 2  # of outlier rejection
+FARTHEST_DESIGN = 4.0  # of a value from the file's, in its standard deviations
 
 
 class Views(NamedTuple):
@@ -71,7 +72,7 @@ def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> Camera
         The camera with its lens, and the fit.
 
     Raises:
-        MembraneError: there are too few views, no lens fits them, or OpenCV is not installed.
+        MembraneError: there are too few views, no lens fits them to `LARGEST_NOISE`, or OpenCV is not installed.
 
     Example:
         >>> board, true = Checkerboard(6, 5, 3.0), Camera("pinhole", (320, 240), (150.0, 151.0), (161.0, 119.0))
@@ -106,7 +107,8 @@ def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequen
         The camera with its ports, and the fit.
 
     Raises:
-        MembraneError: the camera has no ports, `held` has an unknown name, or a view shows too few dots.
+        MembraneError: the camera has no ports, `held` has an unknown name, a view shows too few dots, no ports fit the views to
+            `LARGEST_NOISE`, or those that fit are more than `FARTHEST_DESIGN` standard deviations from the first guess.
 
     Limitations:
         In air, the shift of a ray by a plate depends neither on the plate's distance nor on the medium; in a medium, thickness
@@ -141,6 +143,7 @@ def _fit_camera(problem: "_BoardProblem", poses: np.ndarray, what: str) -> Camer
         theta = fit(problem.residuals, problem.jacobian, theta, what).values
         problem.leave_out_outliers(theta)
     found = fit(problem.residuals, problem.jacobian, theta, what)
+    problem.refuse_unlike(found.values, what)
     _, found_poses, _ = problem.parts(found.values)
     return CameraFit(
         problem.camera_of(found.values), problem.names, found, found_poses.numpy(), problem.pixel_residuals(found.values)
@@ -226,6 +229,26 @@ class _BoardProblem:
         mistaken = outliers(left)
         self.design_weight = self.design_precision * np.median(np.abs(left[~mistaken])) / 0.6745
         self.used[self.visible] = torch.from_numpy(~mistaken)
+
+    def refuse_unlike(self, theta: np.ndarray, what: str) -> None:
+        """Refuse a camera that does not see the board where it is seen, or whose values are far from the file's."""
+        off = float(np.sqrt(np.nanmean(self.pixel_residuals(theta) ** 2) * 2))
+        limit = LARGEST_NOISE * float(np.hypot(*self.camera.image_size))
+        if off > limit:
+            exchanged = ", and that the images in air and in the medium are not exchanged" if self.filled.any() else ""
+            raise MembraneError(
+                f"{what}: the best camera sees the board's points {off:.3g} px (rms) away from where they are; expected at "
+                f"most {limit:.2g}: check the numbers and the spacing of the board's points, in the sensor's length unit"
+                f"{exchanged}"
+            )
+        far = np.abs(theta[: self.count] - self.start) * self.design_precision
+        if (far > FARTHEST_DESIGN).any():
+            k = int(far.argmax())
+            raise MembraneError(
+                f"{what}: {self.names[k]} = {theta[k]:.4g}, the sensor file has {self.start[k]:.4g}; expected a value less "
+                f"than {FARTHEST_DESIGN / self.design_precision[k]:.2g} away: check the spacing of the board's points, which "
+                "scales all lengths, or correct the file"
+            )
 
     def _modelled(self, shared: Tensor, pose: Tensor, filled: Tensor) -> Tensor:
         """Return the modelled pixels of the board's points in one view, `[D, 2]`."""

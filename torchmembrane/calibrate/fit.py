@@ -12,6 +12,7 @@ from ..errors import MembraneError
 
 TOLERANCE, MOST_STEPS = 1e-7, 200
 LEAST = 1e-13  # smallest singular value that counts as nonzero, over the largest
+LARGEST_NOISE = 1e-3  # largest rms residual, over the image's diagonal; noise of located dots is at most a tenth of it
 OUTLIER = 6.0  # robust standard deviations beyond which a residual is an outlier
 
 

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
+from ..errors import MembraneError, expect
 from ..mechanics.cavity import rest_balance
-from ..sensor.factories import elastic_energy
+from ..sensor.factories import AMBIENT, elastic_energy
 from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from ..sensor.units import hectopascal
@@ -51,6 +52,25 @@ class KnownForces(NamedTuple):
         size = np.linalg.norm(self.forces, axis=1)
         own = np.zeros_like(size) if self.deviations is None else np.nan_to_num(self.deviations) / size
         return np.hypot(FORCE_ERROR, own)[np.isfinite(size)]
+
+
+def refuse_overpressure(what: str, overpressure: float | None, sensor: Sensor) -> None:
+    """Refuse a gauge reading at rest, hPa, that is no overpressure, or as large as the absolute pressure of a gas.
+
+    Args:
+        what: name of the calibration, for the message.
+        overpressure: the reading, if there is one.
+        sensor: the sensor.
+    """
+    if overpressure is None:
+        return
+    expect(0 < overpressure < np.inf, f"{what}: overpressure", overpressure, "a positive reading at rest, inside minus outside")
+    absolute = sensor.cavity.pressure if sensor.cavity.filling == "gas" else None
+    if absolute is not None and absolute - overpressure < AMBIENT[0]:
+        raise MembraneError(
+            f"{what}: overpressure = {overpressure:g} hPa, of the gas' {absolute:g} hPa in all; expected inside minus outside: "
+            "subtract the atmosphere's pressure from the reading of an absolute gauge, or correct [cavity] pressure"
+        )
 
 
 class ModulusEvidence(NamedTuple):

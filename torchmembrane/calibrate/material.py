@@ -16,7 +16,15 @@ from ..results.status import Status
 from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from .explained import HEIGHT_SHARE, ExplainedPresses, MeasuredPresses, coarse_reconstructor, explained, with_material
-from .known_modulus import KnownForces, KnownPressures, ModulusEvidence, joined, modulus_at_rest, normal_interval
+from .known_modulus import (
+    KnownForces,
+    KnownPressures,
+    ModulusEvidence,
+    joined,
+    modulus_at_rest,
+    normal_interval,
+    refuse_overpressure,
+)
 from .presses import GAS_ROUNDS, LossProfile
 from .rest_error import HEIGHT_ERROR, StatedHeight, changed_height
 
@@ -94,6 +102,8 @@ def material_from_images(
     Raises:
         MembraneError: an image shows too few markers, or as for `material_from_pixels`.
     """
+    refuse_overpressure("calibrate material", overpressure, sensor)
+    known_forces = _known(forces, len(images))
     progress(0.0, f"markers of {len(images)} images")
     reconstructor = coarse_reconstructor(sensor)
     grey = reconstructor.grey(images)
@@ -102,7 +112,7 @@ def material_from_images(
     displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
-    known = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, StatedHeight(rest_error))
+    known = MeasuredPresses(displacement, confidence, known_forces, pressures, overpressure, StatedHeight(rest_error))
     return _with_own_markers(_material(sensor, reconstructor, known, within(progress, IMAGES_SHARE, 1.0)), sensor)
 
 
@@ -154,6 +164,7 @@ def material_from_pixels(
         prestretch must be equibiaxial, and the rest surface accurate. A prestretch outside the range of `STRETCHES` is found
         near its end.
     """
+    refuse_overpressure("calibrate material", overpressure, sensor)
     reconstructor = coarse_reconstructor(sensor)
     pixels = tensor_of("calibrate material: pixels", pixels).to(reconstructor.rest_pixels)
     known = pixels.ndim == 3 and pixels.shape[1:] == reconstructor.rest_pixels.shape
@@ -164,12 +175,31 @@ def material_from_pixels(
     confidence = (~lost).to(pixels)
     covariance = None if noise is None else reconstructor.observer.covariance_of(noise, confidence)  # type: ignore[operator]
     height = StatedHeight(rest_error)
-    measured = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, height, covariance)
+    of_images = _known(forces, len(pixels))
+    measured = MeasuredPresses(displacement, confidence, of_images, pressures, overpressure, height, covariance)
     return _with_own_markers(_material(sensor, reconstructor, measured, progress), sensor)
 
 
-def _known(forces: np.ndarray | KnownForces | None) -> KnownForces | None:
-    return forces if forces is None or isinstance(forces, KnownForces) else KnownForces(np.asarray(forces, float))
+def _known(forces: np.ndarray | KnownForces | None, count: int) -> KnownForces | None:
+    """Return the known forces of `count` images.
+
+    Raises:
+        MembraneError: their shape is another, none is known, or one is zero.
+    """
+    if forces is None:
+        return None
+    known, what = forces if isinstance(forces, KnownForces) else KnownForces(forces), "calibrate material: forces"
+    values = np.asarray(known.forces, float)
+    right = values.ndim == 2 and len(values) == count and values.shape[1] in (1, 3)
+    expected = f"[{count}, 3] or [{count}, 1]: of each image its force or magnitude, NaN if unknown"
+    expect(right, what, f"an array {list(values.shape)}", expected)
+    expect(np.isfinite(values).all(1).any(), what, "NaN for all images", "at least one known force, or None")
+    expect(not (np.linalg.norm(values, axis=1) == 0).any(), what, "0 N for an image", "presses, NaN where the force is unknown")
+    if known.deviations is None:
+        return KnownForces(values)
+    deviations, what = np.asarray(known.deviations, float), "calibrate material: deviations of forces"
+    expect(deviations.shape == (count,), what, f"an array {list(deviations.shape)}", f"[{count}], one for each image")
+    return KnownForces(values, deviations)
 
 
 def _material(

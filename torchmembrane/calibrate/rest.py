@@ -19,6 +19,7 @@ from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..user_warnings import warn_user
 from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_errors
+from .known_modulus import refuse_overpressure
 from .surface import dot_outlines, fine_surface, frames_at, recalibrated, unit_shapes
 
 NAMES = ["tilt_x", "tilt_y", "tilt_z", "offset_x", "offset_y", "offset_z"]
@@ -68,7 +69,8 @@ def rest_from_image(
         The `RestFit`; for an inflated surface, height and prestretch are fitted as well.
 
     Raises:
-        MembraneError: the sensor lists no dots, or fewer than 8 of them are found.
+        MembraneError: the sensor lists no dots, fewer than 8 of them are found, or the gauge reading contradicts the gas in the
+            cavity or the modulus.
 
     Limitations:
         The surface must have the designed shape. If it has another shape or is in contact, a warning is issued, except if the
@@ -88,6 +90,7 @@ def rest_from_image(
     if sensor.markers.positions is None:
         raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")
     sensor.refuse_heights("calibrate rest")
+    refuse_overpressure("calibrate rest", overpressure, sensor)
     if isinstance(sensor.surface, InflatedSurface):
         from .rest_of_sheet import rest_of_sheet  # here: it builds on this module
 

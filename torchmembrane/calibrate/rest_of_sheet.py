@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
+from ..errors import MembraneError
 from ..files.grayscale import check_image
 from ..progress import Progress
 from ..sensor.inflated import InflatedSurface
@@ -22,6 +23,7 @@ SHEET_NAMES = [*NAMES, "height", "prestretch"]
 STRETCH_ERROR = 0.1  # standard deviation of the file's prestretch; dots alone determine it less accurately
 HELD_ERROR = 0.02  # relative standard deviation of gauge reading over modulus
 STEP = 0.01  # relative step of height and prestretch for finite differences
+LARGEST_RATIO = 1.25  # of the gauge reading and the pressure that the sheet holds with the file's modulus
 ROUNDS = 2
 CENTRED = 0.5  # px, initial guess of the dots' noise
 
@@ -163,6 +165,16 @@ def _known(sensor: Sensor, linear: _Linear, stated: np.ndarray, overpressure: fl
     return np.array(values), np.array(rows)
 
 
+def _refuse_other_pressure(held: float, overpressure: float) -> None:
+    """Refuse a gauge reading that the fitted sheet does not hold; both in hPa."""
+    if not 1 / LARGEST_RATIO < overpressure / held < LARGEST_RATIO:
+        raise MembraneError(
+            f"calibrate rest: the gauge reads {overpressure:g} hPa, but the sheet that fits the image holds {held:.4g} hPa "
+            "with the file's shear modulus and thickness; expected the same to a few per cent: give inside minus outside, or "
+            "correct modulus or prestretch in the file"
+        )
+
+
 def _moved(
     sensor: Sensor,
     dots: _Material,
@@ -180,6 +192,8 @@ def _moved(
     rim = (flat.rim - pivot) @ rotation.T + pivot + offset
     values = {"outline": rim, "height": float(result.values[6])}
     material = flat.material
+    if overpressure is not None and sensor.force_unit == "N":
+        _refuse_other_pressure(flat.formed.pressure * material.modulus / hectopascal(sensor.length_unit), overpressure)
     if overpressure is not None and sensor.force_unit == "relative":
         product = overpressure * hectopascal(sensor.length_unit) / flat.formed.pressure
         thickness = material.thickness or 1.0

@@ -24,14 +24,13 @@ from ..sensor.parts import Markers
 from ..sensor.sensor import Sensor
 from ..sensor.units import millimetre
 from .bundle import Bundle, bundle_adjusted
-from .fit import Fit, rotations, with_common_errors
+from .fit import LARGEST_NOISE, Fit, rotations, with_common_errors
 from .rest import measured_outlines, shading_bias
 from .surface import Correction, correction, fine_surface, recalibrated, surface_projection
 
 TRAVEL_ERROR = 0.01  # mm
 OBSERVED = 0.1  # largest standard deviation of the travel over the travel, so that the scale is determined
 MOST_MOVED = 0.1  # largest rms correction over the surface's size: beyond, the scale differs from the design's
-LARGEST_NOISE = 1e-3  # largest residual, over the image's diagonal; noise of located dots is at most a tenth of it
 NUMBERS = ("turn_x", "turn_y", "turn_z", "place_x", "place_y", "place_z")
 SIDEWAYS = 0.015  # px, common shift of located dots by one-sided shading in a rotated view (0.024 px at 4 degrees)
 

@@ -63,6 +63,10 @@ After an interruption, the same command continues a data set.
 exit code: 0 all well, 1 some presses of a data set failed, 2 wrong usage, or a press that cannot be simulated"""
 
 
+DEFAULTS: dict[str, Any] = {"name": "press", "direction": [0.0, 0.0, 1.0], "turn": 0.0, "frames": 10}
+"""Values of options of a single press that are not given."""
+
+
 def add_parser(commands: Any) -> None:
     """Add the parser of the command."""
     add = add_command(commands, "simulate", run, PURPOSE, EXAMPLES)
@@ -75,7 +79,7 @@ def add_parser(commands: Any) -> None:
         help="folder of the frames: a new one, or one with the same sensor and appearance",
     )
     add_force(add)
-    add("--name", type=file_name, default="press", help="name of the files of a single press (default: %(default)s)")
+    add("--name", type=file_name, help=f"name of the files of a single press (default: {DEFAULTS['name']})")
     _add_press(add)
     _add_sequence(add)
     _add_appearance(add)
@@ -91,16 +95,11 @@ def _add_press(add: Add) -> None:
     add("--sides", metavar="X,Y,Z", type=vector, help="sides of a box; it presses along Z")
     add("--opening", metavar="DEGREES", type=positive, help="opening angle of a wedge")
     add("--depth", metavar="D", type=positive, help="how far the indenter moves from its first touch")
-    direction = "vector from --aim to where the indenter starts (default: %(default)s: it moves towards the camera)"
-    add("--direction", metavar="X,Y,Z", type=vector, default="0,0,1", help=direction)
+    direction = "vector from --aim to where the indenter starts (default: 0,0,1: it moves towards the camera)"
+    add("--direction", metavar="X,Y,Z", type=vector, help=direction)
     add("--aim", metavar="X,Y,Z", type=vector, help="the point to which it moves (default: the middle of the rim)")
-    add(
-        "--turn",
-        metavar="DEGREES",
-        type=number_from(-360, 360),
-        default=0.0,
-        help="rotation about its direction (default: %(default)s)",
-    )
+    turn = f"rotation about its direction (default: {DEFAULTS['turn']:g})"
+    add("--turn", metavar="DEGREES", type=number_from(-360, 360), help=turn)
     friction = number_from(0, MOST_FRICTION)
     add("--friction", metavar="MU", type=friction, default=0.0, help="Coulomb's coefficient of friction (default: %(default)s)")
 
@@ -114,7 +113,7 @@ def _add_sequence(add: Add) -> None:
         type=legs,
         help=f"simulate all frames along a path whose legs are {', '.join(LEGS)}, as push,slide,release",
     )
-    add("--frames", metavar="N", type=count, default=10, help="frames on each leg of --path (default: %(default)s)")
+    add("--frames", metavar="N", type=count, help=f"frames on each leg of --path (default: {DEFAULTS['frames']})")
     add("--video", action="store_true", help="write the frames of --path as NAME.mp4 instead of images (extra video)")
     add("--random", metavar="N", type=count, help="simulate a data set of N random presses")
     add("--seed", type=seed, default=0, help="seed of presses and noise (default: %(default)s)")
@@ -163,6 +162,9 @@ def _add_appearance(add: Add) -> None:
 def run(arguments: Namespace) -> int:
     """Simulate; return the exit code."""
     _check_options(arguments)
+    for name, value in DEFAULTS.items():
+        if getattr(arguments, name) is None:
+            setattr(arguments, name, value)
     if arguments.random is not None:
         announce("simulate --random")
     from .press import simulate
@@ -179,7 +181,8 @@ def _check_options(arguments: Namespace) -> None:
     if arguments.name == "sensor_rest":
         raise MembraneError("--name sensor_rest: the sensor's rest image has this name; expected another one")
     if arguments.random:
-        if extra := given("depth", "slide", "path", "aim", "radius", "sides", "opening"):
+        of_press = "depth", "slide", "path", "aim", "radius", "sides", "opening", "direction", "turn", "name", "frames"
+        if extra := [*given(*of_press), *(["video"] if arguments.video else [])]:
             raise MembraneError(f"--{extra[0]} with --random, which draws the presses itself; expected only one of the two")
         return
     if missing := {"indenter", "depth"} - set(given("indenter", "depth")):
@@ -188,5 +191,9 @@ def _check_options(arguments: Namespace) -> None:
         raise MembraneError(f"--format {arguments.format} goes with --random only")
     if arguments.video and not arguments.path:
         raise MembraneError("--video without --path; add a path, as --path push,slide,release")
+    if arguments.frames is not None and not arguments.path:
+        raise MembraneError("--frames without --path; add a path, as --path push,slide,release")
+    if arguments.path and "slide" not in arguments.path and arguments.slide is not None:
+        raise MembraneError(f"--slide with --path {','.join(arguments.path)}, which has no slide; expected only one of them")
     if arguments.path and "slide" in arguments.path and arguments.slide is None:
         raise MembraneError(f"--path {','.join(arguments.path)} needs --slide X,Y,Z")

@@ -17,7 +17,7 @@ from ..files.provenance import printable
 from ..files.system_files import is_hidden, is_of_system
 from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..results.store import MESH
-from ..sensor.view_images import view_files
+from ..sensor.view_images import view_files, view_of
 
 PICTURE = re.compile("[0-9]{6}|[1-9][0-9]{6,}")
 """Number of a picture in a frame's name, as `picture_name` writes it."""
@@ -199,7 +199,7 @@ def _firsts(paths: list[Path], views: Sequence[str]) -> list[Path]:
     """Return the first view's path for each NAME among the files NAME_VIEW of all views."""
     firsts: dict[Path, Path] = {}
     for path in paths:
-        view = max((view for view in views if path.stem.endswith(f"_{view}")), key=len, default=None)
+        view = view_of(path, views)
         if view is None:
             raise MembraneError(f"{path}: of no view; expected NAME_{', NAME_'.join(views)} of each frame")
         frame = path.with_name(path.stem.removesuffix(view))

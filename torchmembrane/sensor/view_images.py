@@ -120,6 +120,16 @@ def view_files(path: Path, names: Sequence[str]) -> list[Path]:
     return [_existing(path.with_name(f"{stem}_{name}{path.suffix}")) for name in names]
 
 
+def view_of(path: Path, names: Sequence[str]) -> str | None:
+    """Return the view that a file NAME_VIEW belongs to, or None.
+
+    Example:
+        >>> view_of(Path("press_far_left.png"), ["left", "far_left"])
+        'far_left'
+    """
+    return max((name for name in names if path.stem.endswith(f"_{name}")), key=len, default=None)
+
+
 def _existing(path: Path) -> Path:
     """Return the path; if there is no such file, the only image or video of this name with another ending."""
     if path.exists() or not path.parent.is_dir():

@@ -29,7 +29,7 @@ from ...sensor.record import Record
 from ...sensor.sensor import Sensor
 from ...sensor.toml import COORDINATE
 from ...sensor.units import millimetre
-from ...sensor.view_images import view_files
+from ...sensor.view_images import view_files, view_of
 from ...surface.checks import FARTHEST
 
 if TYPE_CHECKING:
@@ -136,7 +136,8 @@ def read_view_images(path: str | Path, sensor: Sensor) -> list[np.ndarray]:
 
 
 def read_targets(images: Sequence[str], sensor: Sensor, number: int, board: Checkerboard | DotBoard) -> np.ndarray:
-    """The board's points in every image that shows it, `[P, D, 2]`; an image that shows none is reported and left out.
+    """The board's points in every image that shows it, `[P, D, 2]`; an image that shows none is reported and left out, and so
+    are images NAME_VIEW of other views.
 
     Args:
         images: files, patterns, folders.
@@ -144,7 +145,10 @@ def read_targets(images: Sequence[str], sensor: Sensor, number: int, board: Chec
         number: number of the view whose images they are, from 0; a mirror shows the board reversed.
         board: the board.
     """
-    found, reason, paths = [], "", single_images(find_inputs(images))
+    found, reason, given, own = [], "", single_images(find_inputs(images)), sensor.views and sensor.views[number].name
+    paths = [path for path in given if view_of(path, sensor.views_apart) in (None, own)]
+    if len(paths) < len(given):
+        print(f"{len(given) - len(paths)} images left out, as their names are those of other views than {own!r}")
     mirrored = bool(sensor.views) and sensor.views[number].pose.determinant < 0
     for path in paths:
         image = read_sensor_image(path, sensor, number)
