@@ -101,7 +101,7 @@ def cavity_filling(sensor: Sensor, membrane: Membrane, *, warn: bool = False) ->
             )
         return CavityFilling("liquid")
     volume = sensor.cavity.volume or membrane.cavity_volume
-    if volume < LEAST_VOLUME * membrane.size**3:
+    if sensor.cavity.volume is None and volume < LEAST_VOLUME * membrane.size**3:
         raise MembraneError(
             f"sensor {sensor.name!r}: the volume between rim and rest surface is {volume:.3g} {sensor.length_unit}^3; expected "
             "the volume of the gas, which this surface does not enclose: add volume to [cavity]"
