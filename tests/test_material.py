@@ -173,6 +173,12 @@ def test_forces_of_another_shape_are_refused_before_the_work(kind):
         material_from_images(sensor(Material("neo_hookean", 1.5)), torch.zeros(2, 1, 480, 640), KnownForces(forces, deviations))
 
 
+def test_the_forces_of_one_image_without_a_batch_are_of_one_image():
+    """Which is blank; its forces are not what is refused."""
+    with pytest.raises(MembraneError, match="image 1: blank"):
+        material_from_images(sensor(Material("neo_hookean", 1.5)), torch.zeros(480, 640), np.array([[1.0]]))
+
+
 @pytest.mark.parametrize("overpressure", [0.0, -12.0, float("nan")])
 def test_a_gauge_at_rest_that_is_no_overpressure_is_refused_before_the_work(overpressure):
     with pytest.raises(MembraneError, match="expected a positive reading at rest, inside minus outside"):

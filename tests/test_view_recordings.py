@@ -136,11 +136,12 @@ def test_a_frame_that_a_view_lacks_is_solved_by_the_other_whichever_it_is(record
     assert "p4.png: of no view; expected NAME_left, NAME_right of each frame" in capsys.readouterr().err
 
 
-def test_a_recording_of_several_cameras_is_read_back_and_shown_with_its_images(recorded, tmp_path, capsys):
+@pytest.mark.parametrize("bits", [(None, 12), (12,)])
+def test_a_recording_of_several_cameras_is_read_back_and_shown_with_its_images(recorded, tmp_path, capsys, bits):
     """Colours of the right camera, of 12 bits, need a TIFF; it lacks the first moment."""
     path, frames, expected, reconstructor = recorded
     stream, folder = TrackedStream(reconstructor), tmp_path / "day"
-    with Recording(folder, stream.mesh, None, 12) as kept:
+    with Recording(folder, stream.mesh, *bits) as kept:
         for number in range(1, 4):
             left, right = frames[number][0], frames[number][1][..., None] * np.uint16(16) + np.arange(3, dtype=np.uint16)
             given = [left, None if number == 1 else right]

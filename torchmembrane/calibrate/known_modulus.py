@@ -61,6 +61,9 @@ def refuse_overpressure(what: str, overpressure: float | None, sensor: Sensor) -
         what: name of the calibration, for the message.
         overpressure: the reading, if there is one.
         sensor: the sensor.
+
+    Raises:
+        MembraneError: the reading is no positive number, or leaves less than `AMBIENT` outside a gas.
     """
     if overpressure is None:
         return

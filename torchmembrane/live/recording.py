@@ -2,7 +2,6 @@
 
 import csv
 from collections.abc import Iterator
-from itertools import repeat
 from pathlib import Path
 from types import TracebackType
 
@@ -38,7 +37,8 @@ class Recording:
     Args:
         folder: new or empty folder.
         mesh: data that all frames share.
-        bits: bit depth of the camera, if 16-bit values use fewer bits; for views with images of their own, one for each.
+        bits: bit depth of the camera, if 16-bit values use fewer bits; for views with images of their own, one for each, or
+            one for all.
 
     Raises:
         MembraneError: the folder is not empty; from `keep` and at the end of the block: the folder cannot be written to. If the
@@ -48,7 +48,8 @@ class Recording:
     def __init__(self, folder: Path, mesh: Mesh, *bits: int | None):
         if folder.exists() and (not folder.is_dir() or not all(map(is_of_system, folder.iterdir()))):
             raise MembraneError(f"--record {folder}: is not empty; expected a new folder for each recording")
-        self.folder, self.bits, self.views = folder, bits, mesh.view_names.split()
+        self.folder, self.views = folder, mesh.view_names.split()
+        self.bits = bits if len(bits) > 1 else (bits or (None,)) * max(1, len(self.views))
         self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)
 
     def __enter__(self) -> "Recording":
@@ -85,9 +86,9 @@ class Recording:
         """Write the frame's image files and yield their paths."""
         path = self.folder / IMAGES
         if isinstance(seen.image, np.ndarray):
-            yield write_as_taken(path / seen.name, seen.image, *self.bits)
+            yield write_as_taken(path / seen.name, seen.image, self.bits[0])
             return
-        for view, image, bits in zip(self.views, seen.image, self.bits or repeat(None), strict=False):
+        for view, image, bits in zip(self.views, seen.image, self.bits, strict=True):
             if image is not None:
                 yield write_as_taken(path / f"{seen.name}_{view}", image, bits)
 
