@@ -103,10 +103,10 @@ def material_from_images(
         MembraneError: an image shows too few markers, or as for `material_from_pixels`.
     """
     refuse_overpressure("calibrate material", overpressure, sensor)
+    progress(0.0, "markers of the images")
     reconstructor = coarse_reconstructor(sensor)
     grey = reconstructor.grey(images)
     known_forces = _known(forces, len(grey))
-    progress(0.0, f"markers of {len(grey)} images")
     with torch.no_grad():
         flow = reconstructor.observer.judge(*reconstructor.observer(grey))
     displacement, confidence, _, status = flow
