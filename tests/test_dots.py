@@ -322,7 +322,7 @@ def test_dots_followed_from_the_frame_before_are_those_searched_for(monkeypatch,
     assert torch.equal(pixels, expected) and torch.equal(confidence, sure)
     assert confidence.min() > 0.5
     _, blobs, log_radius, valid = locate.begin(images)[-4:]
-    *_, kept = locate.match.follow(*locate.match.unstrained(blobs, log_radius, valid), before.expand(len(frames), -1, -1))
+    kept = locate.match.follow(blobs, log_radius, valid, before.expand(len(frames), -1, -1))[3]
     assert kept[:2].all() and not kept[-1]
     monkeypatch.setattr(locate.match, "search", None)
     followed = locate(images[:2], before.expand(2, -1, -1)).pixels

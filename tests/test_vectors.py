@@ -10,50 +10,65 @@ import numpy as np
 import pytest
 
 from torchmembrane import vectors
-from torchmembrane.vectors import BYTES, load, spread, store
+from torchmembrane.vectors import BYTES, load, spread, store, total
 
 
 @numba.njit
-def compute(a, b, total):
+def compute(a, b, found):
     """Formulas of two arrays, a vector at a time from place 3 on."""
-    for k in range(3, 3 + len(total), BYTES // a.itemsize):
+    for k in range(3, 3 + len(found), BYTES // a.itemsize):
         x, y = load(a, k), load(b, k)
-        store(total, k - 3, 2.0 * x - y / x + (y - spread(a, 1)) * 0.5 - 1 + x * y)
+        store(found, k - 3, 2.0 * x - y / x + (y - spread(a, 1)) * 0.5 - 1 + x * y)
 
 
 @numba.njit
-def summed(a, total):
+def summed(a, found):
     """The sum of the vectors of an array, which a loop carries along in a pair."""
     both = load(a, 0) * 0.0, load(a, 0)
     for k in range(0, a.size, BYTES // a.itemsize):
         both = both[0] + load(a, k), load(a, k)
-    store(total, 0, both[0])
+    store(found, 0, both[0])
+
+
+@numba.njit
+def totals(a, sums):
+    """The sum of each vector of an array."""
+    for k in range(len(sums)):
+        sums[k] = total(load(a, k * a.size // len(sums)))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_total_is_the_sum_of_the_numbers_of_one_vector(dtype):
+    lanes, sums = BYTES // np.dtype(dtype).itemsize, np.zeros(3, dtype)
+    a = np.arange(3 * lanes, dtype=dtype)
+    totals(a, sums)
+    np.testing.assert_array_equal(sums, a.reshape(3, lanes).sum(1))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_each_number_is_that_of_the_formula(dtype):
     lanes = BYTES // np.dtype(dtype).itemsize
     a, b = np.random.default_rng(0).uniform(1, 2, (2, 3 + 5 * lanes)).astype(dtype)
-    total = np.zeros(5 * lanes, dtype)
-    compute(a, b, total)
+    found = np.zeros(5 * lanes, dtype)
+    compute(a, b, found)
     x, y = a[3:], b[3:]
-    np.testing.assert_allclose(total, 2 * x - y / x + (y - a[1]) / 2 - 1 + x * y, rtol=20 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(found, 2 * x - y / x + (y - a[1]) / 2 - 1 + x * y, rtol=20 * np.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_places_count_through_all_dimensions_and_loops_carry_vectors(dtype):
     lanes = BYTES // np.dtype(dtype).itemsize
-    a, total = np.arange(6 * lanes, dtype=dtype).reshape(2, 3, lanes), np.zeros(lanes, dtype)
-    summed(a, total)
-    np.testing.assert_array_equal(total, a.sum((0, 1)))
+    a, found = np.arange(6 * lanes, dtype=dtype).reshape(2, 3, lanes), np.zeros(lanes, dtype)
+    summed(a, found)
+    np.testing.assert_array_equal(found, a.sum((0, 1)))
 
 
 def test_nan_and_infinity_keep_their_meaning():
     a = np.full(3 + BYTES // 8, 1.0)
-    b, total = a.copy(), np.zeros(BYTES // 8)
+    b, found = a.copy(), np.zeros(BYTES // 8)
     a[3], b[4] = np.nan, np.inf
-    compute(a, b, total)
-    assert np.isnan(total[0]) and not np.isfinite(total[1]) and np.isfinite(total[2:]).all()
+    compute(a, b, found)
+    assert np.isnan(found[0]) and not np.isfinite(found[1]) and np.isfinite(found[2:]).all()
 
 
 @pytest.mark.parametrize("features, size", [("+avx,+avx2,+fma", 32), ("+avx2,+avx512f,+fma", 64), ("", 32)])
@@ -82,7 +97,7 @@ def test_numbers_are_the_same_without_the_longest_registers():
     )
     assert done.returncode == 0, done.stderr
     size, numbers = done.stdout.split(" ", 1)
-    a, total = np.linspace(1, 2, 99, dtype="f"), np.zeros(64, "f")
-    compute(a, a[::-1].copy(), total)
+    a, found = np.linspace(1, 2, 99, dtype="f"), np.zeros(64, "f")
+    compute(a, a[::-1].copy(), found)
     assert size == "32"
-    np.testing.assert_allclose(json.loads(numbers), total, rtol=1e-5)
+    np.testing.assert_allclose(json.loads(numbers), found, rtol=1e-5)

@@ -1,8 +1,8 @@
 """Vectors of consecutive numbers in machine code: an operation computes as many numbers as a register of the processor holds.
 
-`load` reads a vector from an array, `spread` fills one with a single number, and `store` writes it. Between these, `+`, `-`,
-`*` and `/` compute with vectors, and with numbers, which stand for vectors of equal numbers. Without this, numba uses the
-processor's vectors only for simple loops.
+`load` reads a vector from an array, `spread` fills one with a single number, `store` writes it, and `total` sums its numbers.
+Between these, `+`, `-`, `*` and `/` compute with vectors, and with numbers, which stand for vectors of equal numbers. Without
+this, numba uses the processor's vectors only for simple loops.
 """
 
 import operator
@@ -10,7 +10,7 @@ from typing import Any
 
 from llvmlite import binding, ir
 from numba import types
-from numba.core import config
+from numba.core import cgutils, config
 from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 
@@ -86,6 +86,19 @@ def store(typing: Any, array: Any, at: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), codegen
+
+
+@intrinsic
+def total(typing: Any, value: Any) -> Any:
+    """Return the sum of a vector's numbers, in any order."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        whole, number = args[0].type, args[0].type.element
+        name = f"llvm.vector.reduce.fadd.v{whole.count}{number.intrinsic_name}"
+        add = cgutils.get_or_insert_function(builder.module, ir.FunctionType(number, [number, whole]), name)
+        return builder.call(add, [ir.Constant(number, 0.0), args[0]], fastmath=("reassoc",))
+
+    return value.dtype(value), codegen
 
 
 def _define(operation: Any, instruction: str) -> None:

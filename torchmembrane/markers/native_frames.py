@@ -25,9 +25,16 @@ def found_by(function: Any, constants: tuple[Any, ...], given: tuple[Tensor, ...
     frames = next((len(value) for value in given if len(value) != 1), 1)
     found = given[0].new_empty(frames, *shape)
     with KEPT_STEPS[function].compiling(np.dtype(np.float32)):
-        each = (value.expand(frames, *value.shape[1:]).contiguous().numpy() for value in given)
+        each = [_array(value, frames) for value in given]
         in_threads(partial(function, constants), *each, found.numpy())
     return found
+
+
+def _array(value: Tensor, frames: int) -> np.ndarray:
+    """Return a tensor of the frames, or one for all of them, as a contiguous array."""
+    if len(value) != frames:
+        value = value.expand(frames, *value.shape[1:])
+    return value.contiguous().numpy()
 
 
 @compiled

@@ -112,12 +112,12 @@ class BlobDetector(nn.Module):
 
     def forward(self, levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Locate blobs in `levels` of `mean_pyramid` with dark dots: centres `[B, K, 2]` px, log radius, strength `[B, K]`."""
-        background = self.background(levels[-1]) + SHADE
         scales = [scale(levels) for scale in self.scales]
-        if is_native(*scales, background, self.inside):
-            given = torch.cat(scales, 1), background[:, 0]
+        if is_native(*scales, levels[-1], self.inside):
+            given = torch.cat(scales, 1), levels[-1][:, 0]
             found = found_by(peaks, self.native.of(self, self.inside), given, self.count, 4)
             return found[..., :2], found[..., 2], found[..., 3]
+        background = self.background(levels[-1]) + SHADE
         peak = reduce(torch.maximum, scales) / background.square() * self.inside
         strength, cell = (peak * (peak == highest_around(peak, self.reach))).flatten(1).topk(self.count)
         strength = strength.clamp_min(1e-20).sqrt()

@@ -80,6 +80,10 @@ class DotMatcher(nn.Module):
         """Return the buffers of `choose`, as machine code takes them."""
         return self.pixels.numpy(), self.stiffness.numpy(), self.numbers.numpy()
 
+    def of_scene(self) -> tuple[Any, ...]:
+        """Return the buffers of `base`, as machine code takes them."""
+        return self.log_radius.numpy(), self.stiffness.numpy(), self.origin.numpy(), self.size_tolerance
+
     def following(self) -> tuple[Any, ...]:
         """Return the buffers of `follow` and `sure`, as machine code takes them."""
         return self.averages.constants(), self.chooser(), self.seen.numpy(), self.origin.numpy(), FOUND
@@ -144,14 +148,13 @@ class DotMatcher(nn.Module):
         Returns:
             Positions `[B, D, 2]` px, certainty `[B, D]` in 0..1 and strain `[B, D, 2, 2]`.
         """
-        unstrained = self.unstrained(blobs, log_radius, valid)
-        *followed, kept = self.follow(*unstrained, previous)
+        *followed, kept, weight, flow, strain, complete = self.follow(blobs, log_radius, valid, previous)
 
         def searched() -> Sequence[Tensor]:
-            return self.better(kept, *followed, *self.search(blobs, log_radius, valid, previous))
+            better = self.better(kept, *followed, *self.search(blobs, log_radius, valid, previous))
+            return self.sure(*better, *self.unstrained(blobs, log_radius, valid))
 
-        weight, flow, strain = cond(kept, followed, searched)
-        weight, flow, strain, complete = self.sure(weight, flow, strain, *unstrained)
+        weight, flow, strain, complete = cond(kept, (weight, flow, strain, complete), searched)
 
         def doubted() -> Sequence[Tensor]:
             known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
@@ -215,21 +218,25 @@ class DotMatcher(nn.Module):
         return flow, (finite & enough) | (found & ~enough)  # onnxruntime chooses between numbers only
 
     @traced
-    def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def follow(self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None) -> tuple[Tensor, ...]:
         """Follow the dots from their previous pixels (without them, from rest), in the `unstrained` scene.
 
         Returns:
-            Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]`, as `search` does; and `[B]` bool, whether every dot
-            that was found in the previous frame was found again.
+            Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]`, as `search` does; `[B]` bool, whether every dot that
+            was found in the previous frame was found again; and the four results of `sure` for these dots.
         """
-        before = base.new_full((1, *self.pixels.shape), torch.nan) if previous is None else previous
-        if is_native(known, base, before, self.pixels):
-            return _parts(found_by(followed, self.following(), (known, base, before), 8, len(self.pixels)))
+        before = blobs.new_full((1, *self.pixels.shape), torch.nan) if previous is None else previous
+        if is_native(blobs, log_radius, valid, before, self.pixels):
+            given = blobs, log_radius, valid, before
+            found = found_by(followed, (self.of_scene(), self.following()), given, 16, len(self.pixels))
+            return *_parts(found[:, :8]), *_parts(found[:, 8:])
+        known, base = self.unstrained(blobs, log_radius, valid)
         flow, found = self.flow_before(previous)
         weight, flow = found.to(base.dtype), flow.mT
         state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
         weight, flow, strain = self.settle(*state, known, base)
-        return weight, flow, strain, ~(found & ~(weight >= FOUND)).any(-1)
+        kept = ~(found & ~(weight >= FOUND)).any(-1)
+        return weight, flow, strain, kept, *self.sure(weight, flow, strain, known, base)
 
     @traced
     def sure(
@@ -280,10 +287,7 @@ class DotMatcher(nn.Module):
     def base(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> Tensor:
         """Return the part `[B, D, K]` of the cost of `choose` that does not depend on the prediction."""
         if is_native(blobs, log_radius, valid, self.pixels):
-            buffers = (buffer.numpy() for buffer in (self.log_radius, self.stiffness, self.origin))
-            return found_by(
-                bases, (*buffers, self.size_tolerance), (blobs, log_radius, valid), len(self.pixels), blobs.shape[1]
-            )
+            return found_by(bases, self.of_scene(), (blobs, log_radius, valid), len(self.pixels), blobs.shape[1])
         square = (blobs - self.origin).mT.square().sum(1, keepdim=True)
         return self.misfit(log_radius, valid) + self.stiffness[:, None] * square
 

@@ -14,7 +14,7 @@ from .. import native_frames
 from ..native_frames import KEPT_STEPS, largest
 from . import probability, scales
 from .probability import LEAST, contrast_evidence
-from .scales import FAINT
+from .scales import FAINT, SHADE
 
 _contrast_evidence = compiled(contrast_evidence)
 
@@ -42,6 +42,13 @@ class Peaks(NamedTuple):
 
     inside: Any
     """`[rows, columns]`"""
+    first_v: Any
+    """`[rows]`, the first row of the coarsest level that the background of each row of cells takes."""
+    along_v: Any
+    """`[rows, T]`, the weights of that row and those that follow."""
+    first_u: Any
+    """The same of columns."""
+    along_u: Any
     log_radii: Any
     corner: Any
     cell: int
@@ -95,6 +102,28 @@ def _on_cells(c, response, found):
                 found[i, k] = above + down * (below - above)
             else:
                 found[i, k] = response[i, k]
+
+
+@compiled
+def _relative(c, scales, coarse, middle, peak):
+    """Write the largest response over the squared background inside the membrane, `[rows, columns]`; `coarse`: the coarsest
+    level."""
+    for i in range(len(peak)):
+        middle[:] = 0
+        for t in range(c.along_v.shape[1]):
+            weight, line = c.along_v[i, t], coarse[c.first_v[i] + t]
+            for k in range(len(middle)):
+                middle[k] += weight * line[k]
+        for k in range(peak.shape[1]):
+            background, line, weights = np.float32(0), middle[c.first_u[k] :], c.along_u[k]
+            for t in range(len(weights)):
+                background += weights[t] * line[t]
+            peak[i, k] = background + np.float32(SHADE)
+        for k in range(peak.shape[1]):
+            highest = scales[0, i, k]
+            for s in range(1, len(scales)):
+                highest = max(highest, scales[s, i, k])
+            peak[i, k] = highest / (peak[i, k] * peak[i, k]) * c.inside[i, k]
 
 
 @compiled
@@ -161,17 +190,12 @@ def _entries(sources: str) -> Any:
             _on_cells(c, response, found[b])
 
     @kept
-    def peaks(c, scales, background, found):
-        """Fill `found [B, K, 4]`: centre, log radius, strength; from `scales [B, S, rows, columns]`."""
-        peak, count = np.empty_like(c.inside), found.shape[1]
+    def peaks(c, scales, coarse, found):
+        """Fill `found [B, K, 4]`: centre, log radius, strength; from `scales [B, S, rows, columns]` and the coarsest level."""
+        peak, count, middle = np.empty_like(c.inside), found.shape[1], np.empty(coarse.shape[2], np.float32)
         values, places, cells = np.empty(peak.size, np.float32), np.empty(peak.size, np.int64), np.empty(count, np.int64)
         for b in range(len(found) if sources else 0):
-            for i in range(len(peak)):
-                for k in range(peak.shape[1]):
-                    highest = scales[b, 0, i, k]
-                    for s in range(1, scales.shape[1]):
-                        highest = max(highest, scales[b, s, i, k])
-                    peak[i, k] = highest / (background[b, i, k] * background[b, i, k]) * c.inside[i, k]
+            _relative(c, scales[b], coarse[b], middle, peak)
             maxima, flat = _maxima(c, peak, values, places, cells), peak.reshape(-1)
             for k in range(count):
                 height = flat[cells[k]] if k < maxima else np.float32(0)
@@ -206,17 +230,13 @@ KEPT_STEPS.update({function: Kept(function, SOURCES, 4) for function in (respons
 def scale_constants(scale: Any) -> Scale:
     """Return the constants of a `HessianScale`."""
     along_v, along_u = (_dense(blur)[: side + 2] for blur, side in ((scale.blur_v, scale.rows), (scale.blur_u, scale.columns)))
-    first_v, last_v = _range(along_v)
-    first_v = np.minimum(first_v, along_v.shape[1] - (last_v - first_v).max() - 1)
-    taken = first_v[:, None] + np.arange((last_v - first_v).max() + 1)
     first, last = (end - np.arange(len(along_u)) for end in _range(along_u))
     column = np.arange(len(along_u)) + np.arange(first.min(), last.max() + 1)[:, None]
     is_there = (column >= 0) & (column < along_u.shape[1])
     weights = np.where(is_there, along_u[np.arange(len(along_u)), column.clip(0, along_u.shape[1] - 1)], 0)
     cells_v, cells_u = [np.zeros(0)] * 2 if scale.spread is None else scale.cells
     return Scale(
-        first_v,
-        np.take_along_axis(along_v, taken, 1),
+        *_banded(along_v),
         int(first.min()),
         weights.astype(np.float32),
         cells_v.astype(np.float32),
@@ -228,7 +248,10 @@ def scale_constants(scale: Any) -> Scale:
 def peak_constants(detector: Any) -> Peaks:
     """Return the constants of a `BlobDetector`."""
     inside, log_radii, corner = (value.numpy() for value in (detector.inside[0, 0], detector.log_radii, detector.corner))
-    return Peaks(inside, log_radii, corner, detector.cell, detector.reach)
+    along_v, along_u = (_banded(matrix.numpy()) for matrix in (detector.background.along_v, detector.background.along_u.mT))
+    (first_v, weights_v), (first_u, weights_u) = along_v, along_u
+    first_v, first_u = first_v + detector.background.rows.start, first_u + detector.background.columns.start
+    return Peaks(inside, first_v, weights_v, first_u, weights_u, log_radii, corner, detector.cell, detector.reach)
 
 
 def _dense(blur: Any) -> np.ndarray:
@@ -237,6 +260,14 @@ def _dense(blur: Any) -> np.ndarray:
     matrix = np.zeros((*blocks.shape[:2], columns.max() + 1), np.float32)
     np.put_along_axis(matrix, np.broadcast_to(columns[:, None], blocks.shape), blocks, 2)
     return matrix.reshape(-1, matrix.shape[2])
+
+
+def _banded(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first columns `[m]` and the weights `[m, T]` of a band matrix."""
+    first, last = _range(matrix)
+    width = (last - first).max() + 1
+    first = np.minimum(first, matrix.shape[1] - width)
+    return first, np.take_along_axis(matrix, first[:, None] + np.arange(width), 1)
 
 
 def _range(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

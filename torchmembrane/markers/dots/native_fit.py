@@ -12,7 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...machine_code import Kept, compiled, fingerprint, in_threads, kept
+from ... import vectors
+from ...machine_code import Kept, compiled, fingerprint, in_threads, inlined, kept
+from ...vectors import BYTES, load, total
 from .scales import FAINT
 
 MISFIT = 0.02
@@ -20,6 +22,8 @@ MISFIT = 0.02
 
 LANES, FIELDS, UNKNOWNS = 16, 8, 7
 """Pixels of a block; fields of a pixel, the last the window itself; unknowns of a fit."""
+VECTOR = BYTES // 4
+"""Pixels of a vector register."""
 HALF, ONE, TINY = np.float32(0.5), np.float32(1), np.float32(1e-12)
 LARGEST = np.float32(7.90531110763549805)
 """Above this value tanh is 1."""
@@ -136,36 +140,42 @@ def _outlined(c, d, rows, offset, growth, before, window, fields):
             fields[at + 7 * LANES + k] = root * own
 
 
-@compiled
-def _tile(a, b, p, q, r, s, gram):
-    """Write the products of two rows with four others: the eight sums are in registers, and a row is read once for several."""
-    ap, aq, ar, at = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-    bp, bq, br, bt = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-    for k in range(len(a)):
-        ap += a[k] * p[k]
-        aq += a[k] * q[k]
-        ar += a[k] * r[k]
-        at += a[k] * s[k]
-        bp += b[k] * p[k]
-        bq += b[k] * q[k]
-        br += b[k] * r[k]
-        bt += b[k] * s[k]
-    gram[0, 0], gram[0, 1], gram[0, 2], gram[0, 3] = ap, aq, ar, at
-    gram[1, 0], gram[1, 1], gram[1, 2], gram[1, 3] = bp, bq, br, bt
+@inlined
+def _tile(fields, i, j, gram):
+    """Write the products of two fields, from the i-th on, with four, from the j-th on; their eight sums stay in registers."""
+    a, b = load(fields, i * LANES), load(fields, (i + 1) * LANES)
+    p, q, r, s = _four(fields, j * LANES)
+    ap, aq, ar, at, bp, bq, br, bt = a * p, a * q, a * r, a * s, b * p, b * q, b * r, b * s
+    for n in range(1, len(fields) // FIELDS // VECTOR):
+        here = n * VECTOR // LANES * FIELDS * LANES + n * VECTOR % LANES
+        a, b = load(fields, here + i * LANES), load(fields, here + (i + 1) * LANES)
+        p, q, r, s = _four(fields, here + j * LANES)
+        ap, aq, ar, at, bp, bq, br, bt = (
+            ap + a * p,
+            aq + a * q,
+            ar + a * r,
+            at + a * s,
+            bp + b * p,
+            bq + b * q,
+            br + b * r,
+            bt + b * s,
+        )
+    gram[i, j], gram[i, j + 1], gram[i, j + 2], gram[i, j + 3] = total(ap), total(aq), total(ar), total(at)
+    gram[i + 1, j], gram[i + 1, j + 1], gram[i + 1, j + 2], gram[i + 1, j + 3] = total(bp), total(bq), total(br), total(bt)
+
+
+@inlined
+def _four(fields, at):
+    """Return vectors of four fields."""
+    return load(fields, at), load(fields, at + LANES), load(fields, at + 2 * LANES), load(fields, at + 3 * LANES)
 
 
 @compiled
-def _products(fields, each, gram):
-    """`EllipseFit._gram`: the products `[8, 8]` of the fields, which are brought into rows, `each [8, P']`."""
-    for i in range(FIELDS):
-        row = each[i]
-        for block in range(len(row) // LANES):
-            first, at = block * LANES, (block * FIELDS + i) * LANES
-            for k in range(LANES):
-                row[first + k] = fields[at + k]
+def _products(fields, gram):
+    """Apply `EllipseFit._gram`: write the products `[8, 8]` of the fields."""
     for i in range(0, FIELDS, 2):
         for j in range(0, i + 2, 4):
-            _tile(each[i], each[i + 1], each[j], each[j + 1], each[j + 2], each[j + 3], gram[i : i + 2, j : j + 4])
+            _tile(fields, i, j, gram)
     for i in range(FIELDS):
         for j in range(i):
             gram[j, i] = gram[i, j]
@@ -173,19 +183,21 @@ def _products(fields, each, gram):
 
 @compiled
 def _fitted(c, d, gram, system):
-    """Solve `system [7, 10]` in place; it becomes `[1 x]` for the loads of the window and of the centre's two coordinates."""
+    """Fill `system [7, LANES]` and solve it in place; it becomes `[1 x 0]` for the loads of the window and of the centre's two
+    coordinates."""
     for a in range(UNKNOWNS):
         for b in range(UNKNOWNS):
             system[a, b] = gram[a, b] + c.ridge[d, a, b]
+        system[a, 7:] = 0
         system[a, 7], system[a, 8], system[a, 9] = gram[a, 7], np.float32(a == 4), np.float32(a == 5)
     for a in range(UNKNOWNS):
         pivot = ONE / system[a, a]
-        for e in range(a, UNKNOWNS + 3):
+        for e in range(LANES):
             system[a, e] *= pivot
         for b in range(UNKNOWNS):
             share = system[b, a]
             if b != a:
-                for e in range(a, UNKNOWNS + 3):
+                for e in range(LANES):
                     system[b, e] -= share * system[a, e]
 
 
@@ -217,12 +229,8 @@ def _entry(sources: str) -> Any:
         """Fit all dots of all frames: arguments as of `EllipseFit.forward`, levels `[B, H, W]`; `dots [B, D, 6]`, the centre,
         growth, share explained, contrast and misfit, and `covariance [B, D, 2, 2]` are filled."""
         pixels, few = c.offsets.shape[1], np.empty((6, 5), np.float32)
-        window, fields, each = (
-            np.zeros(pixels, np.float32),
-            np.empty(FIELDS * pixels, np.float32),
-            np.empty((FIELDS, pixels), np.float32),
-        )
-        rows, gram, system = np.empty((4, 4), np.float32), np.empty((8, 8), np.float32), np.empty((7, 10), np.float32)
+        window, fields = np.zeros(pixels, np.float32), np.empty(FIELDS * pixels, np.float32)
+        rows, gram, system = np.empty((4, 4), np.float32), np.empty((8, 8), np.float32), np.empty((7, LANES), np.float32)
         middle, offset, change, moved, before, reach = few[0], few[1], few[2], few[3], few[4], few[5]
         for b in range(len(centres) if sources else 0):
             for d in range(centres.shape[1]):
@@ -236,7 +244,7 @@ def _entry(sources: str) -> Any:
                     for a in range(2):
                         offset[a] = (middle[a] - centre[a]) * unit - moved[a]
                     _outlined(c, d, rows, offset, moved[2], before, window, fields)
-                    _products(fields, each, gram)
+                    _products(fields, gram)
                     _fitted(c, d, gram, system)
                     gain = system[3, 7] / (system[3, 7] ** 2 + np.float32(1e-6))
                     for a in range(3):
@@ -253,7 +261,7 @@ def _entry(sources: str) -> Any:
     return fits
 
 
-SOURCES = fingerprint(__file__)
+SOURCES = fingerprint(__file__, vectors.__file__)
 fits = _entry(SOURCES)
 kept_fits = Kept(fits, SOURCES, 8)
 """Whether `fits` has been compiled."""

@@ -6,30 +6,29 @@ On a processor the tensor operations of a step, some seventy, take longer to beg
 
 import numpy as np
 
-from ...machine_code import Kept, compiled, fingerprint, kept
+from ...machine_code import Kept, fingerprint, inlined, kept
 from ..native_frames import KEPT_STEPS
 
 
-@compiled
-def _sums(weight, fields, moments, rows, sums):
+@inlined
+def _sums(weight, fields, moments, sums):
     """Compute `sums [R, M D] = rows @ moments`; the rows are the weight, and the weight times each of `fields [R - 1, D]`."""
-    for r in range(len(sums)):
-        sums[r] = 0
-        for n in range(len(weight)):
-            rows[n] = weight[n] if r == 0 else weight[n] * fields[r - 1, n]
-        for n in range(len(weight)):
-            if rows[n] != 0:
-                share, row, total = rows[n], moments[n], sums[r]
+    sums[:] = 0
+    for n in range(len(weight)):
+        row = moments[n]
+        for r in range(len(sums)):
+            share, total = weight[n] if r == 0 else weight[n] * fields[r - 1, n], sums[r]
+            if share != 0:
                 for k in range(len(row)):
                     total[k] += share * row[k]
 
 
-@compiled
-def _gradient(c, weight, flow, prior, rows, sums, gradient):
+@inlined
+def _gradient(c, weight, flow, prior, sums, gradient):
     """Apply `FlowAverages.gradient` to one frame."""
     moments, _, _, raised, pull, h = c
     count = len(h)
-    _sums(weight, flow, moments, rows, sums)
+    _sums(weight, flow, moments, sums)
     for d in range(count):
         total = sums[0, d] + raised[0, d]
         u, v = (sums[0, count + d] + raised[1, d]) / total, (sums[0, 2 * count + d] + raised[2, d]) / total
@@ -44,8 +43,8 @@ def _gradient(c, weight, flow, prior, rows, sums, gradient):
             gradient[a, 0, d], gradient[a, 1, d] = (p * vv - q * uv) / determinant, (q * uu - p * uv) / determinant
 
 
-@compiled
-def _along(c, weight, flow, gradient, fields, rows, sums, found):
+@inlined
+def _along(c, weight, flow, gradient, fields, sums, found):
     """Apply `FlowAverages.along` to one frame: write the flow and the support to `found [3, D]`."""
     _, moments, still, _, _, h = c
     count = len(h)
@@ -54,7 +53,7 @@ def _along(c, weight, flow, gradient, fields, rows, sums, found):
             fields[a, d] = flow[a, d]
             for b in range(2):
                 fields[2 + 2 * a + b, d] = gradient[a, b, d]
-    _sums(weight, fields, moments, rows, sums)
+    _sums(weight, fields, moments, sums)
     for d in range(count):
         support = sums[0, d] + still[0, d]
         for a in range(2):
@@ -65,7 +64,7 @@ def _along(c, weight, flow, gradient, fields, rows, sums, found):
         found[2, d] = support
 
 
-@compiled
+@inlined
 def _choice(c, predicted, support, blobs, base, least, found):
     """`DotMatcher.choose` of a frame: `found [7, D]`, the weight, the flow and the strain; `numbers`: as of `match`."""
     pixels, stiffness, numbers = c
@@ -97,18 +96,18 @@ def _choice(c, predicted, support, blobs, base, least, found):
 @kept
 def gradients(c, weight, flow, prior, found):
     """Fill `found [B, 2, 2, D]` for all frames."""
-    rows, sums = np.empty(len(c[5]), np.float32), np.empty((3, c[0].shape[1]), np.float32)
+    sums = np.empty((3, c[0].shape[1]), np.float32)
     for b in range(len(found)):
-        _gradient(c, weight[b], flow[b], prior[b], rows, sums, found[b])
+        _gradient(c, weight[b], flow[b], prior[b], sums, found[b])
 
 
 @kept
 def flows(c, weight, flow, gradient, found):
     """Fill `found [B, 3, D]` for all frames."""
     count = len(c[5])
-    rows, fields, sums = np.empty(count, np.float32), np.empty((6, count), np.float32), np.empty((7, 3 * count), np.float32)
+    fields, sums = np.empty((6, count), np.float32), np.empty((7, 3 * count), np.float32)
     for b in range(len(found)):
-        _along(c, weight[b], flow[b], gradient[b], fields, rows, sums, found[b])
+        _along(c, weight[b], flow[b], gradient[b], fields, sums, found[b])
 
 
 @kept

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from ...machine_code import Kept, compiled, fingerprint, kept
+from ...machine_code import Kept, compiled, fingerprint, inlined, kept
 from ..native_frames import KEPT_STEPS
 from . import native_flow, probability
 from .native_flow import _along, _choice, _gradient
 from .probability import LEAST
 
 
-@compiled
-def _settled(averages, chooser, state, known, base, rows, moments, fields, found):
+@inlined
+def _settled(averages, chooser, state, known, base, work, found):
     """`DotMatcher.settle` of a frame, from `state [7, D]` to `found [7, D]`."""
-    sums, first, gradient, predicted, least = moments
+    sums, first, gradient, predicted, least, fields = work
     weight, flow, strain = state[0], state[1:3], state[3:].reshape(2, 2, -1)
-    _gradient(averages, weight, flow, strain, rows, sums, gradient)
-    _along(averages, weight, flow, gradient, fields, rows, first, predicted)
+    _gradient(averages, weight, flow, strain, sums, gradient)
+    _along(averages, weight, flow, gradient, fields, first, predicted)
     _choice(chooser, predicted[:2], predicted[2], known, base, least, found)
 
 
@@ -30,14 +30,35 @@ def _work(averages):
     """Return arrays for the steps of one frame."""
     count, width, one = len(averages[5]), averages[0].shape[1], np.float32
     moments = np.empty((3, width), one), np.empty((7, averages[1].shape[1]), one), np.empty((2, 2, count), one)
-    return np.empty(count, one), (*moments, np.empty((3, count), one), np.empty(count, one)), np.empty((6, count), one)
+    return *moments, np.empty((3, count), one), np.empty(count, one), np.empty((6, count), one)
 
 
-@compiled
+@inlined
+def _base(c, blobs, log_radius, valid, base):
+    """Write `DotMatcher.base` of a frame, `[D, K]`."""
+    radii, stiffness, origin, tolerance = c
+    for k in range(len(valid)):
+        no_dot = -2 * np.log(max(valid[k], np.float32(LEAST)))
+        square = (blobs[k, 0] - origin[0]) ** 2 + (blobs[k, 1] - origin[1]) ** 2
+        for d in range(len(radii)):
+            base[d, k] = ((radii[d] - log_radius[k]) / tolerance) ** 2 + no_dot + stiffness[d] * square
+
+
+@inlined
+def _unstrained(c, blobs, log_radius, valid, known, base):
+    """Apply `DotMatcher.unstrained` to one frame: `known [7, K]` and `base [D, K]`."""
+    known[0], known[3:] = 1, 0
+    for k in range(len(blobs)):
+        for a in range(2):
+            known[1 + a, k] = blobs[k, a] - c[2][a]
+    _base(c, blobs, log_radius, valid, base)
+
+
+@inlined
 def _followed(c, known, base, previous, work, state, before, found):
-    """Apply `DotMatcher.follow` to one frame; `before [3, D]`: working memory for what the previous frame knows."""
+    """Write the followed dots of `DotMatcher.follow` in one frame; `before [3, D]`: working memory for what the previous frame
+    knows."""
     averages, chooser, seen, origin, least_weight = c
-    rows, moments, fields = work
     count = 0
     for d in range(len(seen)):
         is_known = np.isfinite(previous[d, 0]) and np.isfinite(previous[d, 1])
@@ -49,51 +70,53 @@ def _followed(c, known, base, previous, work, state, before, found):
             is_moved = enough and before[0, d] > 0
             before[1 + a, d] = previous[d, a] - chooser[0][d, a] - origin[a] if is_moved else 0
     state[:] = 0
-    predicted, least = moments[3], moments[4]
-    _along(averages, before[0], before[1:3], state[3:].reshape(2, 2, -1), fields, rows, moments[1], predicted)
+    _, first, _, predicted, least, fields = work
+    _along(averages, before[0], before[1:3], state[3:].reshape(2, 2, -1), fields, first, predicted)
     _choice(chooser, predicted[:2], predicted[2], known, base, least, state)
-    _settled(averages, chooser, state, known, base, rows, moments, fields, found)
+    _settled(averages, chooser, state, known, base, work, found)
     found[7] = 1
     for d in range(len(seen)):
         if before[0, d] > 0 and not found[0, d] >= least_weight:
             found[7] = 0
 
 
-@compiled
+@inlined
 def _sure(c, weight, flow, known, base, work, state, found):
     """Apply `DotMatcher.sure` to one frame."""
     averages, chooser, seen, _, least_weight = c
-    rows, moments, fields = work
     state[:], complete = 0, 1
     for d in range(len(seen)):
         if weight[d] >= least_weight:
             state[0, d], state[1, d], state[2, d] = 1, flow[0, d], flow[1, d]
         elif seen[d]:
             complete = 0
-    _settled(averages, chooser, state, known, base, rows, moments, fields, found)
+    _settled(averages, chooser, state, known, base, work, found)
+    sums, _, gradient, _, _, _ = work
     strain = found[3:7].reshape(2, 2, -1)
-    _gradient(averages, found[0], found[1:3], strain, rows, moments[0], moments[2])
-    strain[:], found[7] = moments[2], complete
+    _gradient(averages, found[0], found[1:3], strain, sums, gradient)
+    strain[:], found[7] = gradient, complete
 
 
 def _entries(sources: str) -> Any:
     @kept
     def bases(c, blobs, log_radius, valid, found):
         """Fill `found [B, D, K]` with `DotMatcher.base`."""
-        radii, stiffness, origin, tolerance = c
         for b in range(len(found) if sources else 0):
-            for k in range(found.shape[2]):
-                no_dot = -2 * np.log(max(valid[b, k], np.float32(LEAST)))
-                square = (blobs[b, k, 0] - origin[0]) ** 2 + (blobs[b, k, 1] - origin[1]) ** 2
-                for d in range(len(radii)):
-                    found[b, d, k] = ((radii[d] - log_radius[b, k]) / tolerance) ** 2 + no_dot + stiffness[d] * square
+            _base(c, blobs[b], log_radius[b], valid[b], found[b])
 
     @kept
-    def followed(c, known, base, previous, found):
-        """Fill `found [B, 8, D]` with `DotMatcher.follow`: weight, flow, strain, and last 1 if every dot was found again."""
-        work, state, before = _work(c[0]), np.zeros_like(found[0, :7]), np.empty_like(found[0, :3])
+    def followed(c, blobs, log_radius, valid, previous, found):
+        """Fill `found [B, 16, D]` with `DotMatcher.follow`: weight, flow, strain, and 1 if every dot was found again; then the
+        same of the sure dots, and last 1 if all dots are found."""
+        of_scene, of_match = c
+        work, state, before = _work(of_match[0]), np.zeros_like(found[0, :7]), np.empty_like(found[0, :3])
+        known = np.empty((7, blobs.shape[1]), np.float32)
+        base = np.empty((found.shape[2], blobs.shape[1]), np.float32)
         for b in range(len(found) if sources else 0):
-            _followed(c, known[b], base[b], previous[b], work, state, before, found[b])
+            followed, sure = found[b, :8], found[b, 8:]
+            _unstrained(of_scene, blobs[b], log_radius[b], valid[b], known, base)
+            _followed(of_match, known, base, previous[b], work, state, before, followed)
+            _sure(of_match, followed[0], followed[1:3], known, base, work, state, sure)
 
     @kept
     def sure_states(c, weight, flow, known, base, found):

@@ -153,13 +153,13 @@ def _entries(sources: str) -> Any:
         """Fill `found [B, D, 2, 2]` with the outlines from which fits start; `certainty [B, D]`, `place [B, D, 2]` px, `strain
         [B, 2, 2, D]`."""
         count = len(c.rest)
-        rows, sums = np.empty(count, np.float32), np.empty((3, c.averages[0].shape[1]), np.float32)
+        sums = np.empty((3, c.averages[0].shape[1]), np.float32)
         flow, gradient = np.empty((2, count), np.float32), np.empty((2, 2, count), np.float32)
         for b in range(len(found) if sources else 0):
             for d in range(count):
                 for a in range(2):
                     flow[a, d] = place[b, d, a] - c.rest[d, a]
-            _gradient(c.averages, certainty[b], flow, strain[b], rows, sums, gradient)
+            _gradient(c.averages, certainty[b], flow, strain[b], sums, gradient)
             for d in range(count):
                 for a in range(2):
                     for e in range(2):
@@ -172,7 +172,7 @@ def _entries(sources: str) -> Any:
         """Fill `found [B, 3, D]`, confidence and pixels; `size`: width and height of the images."""
         c, size = c_and_size
         count = len(c.rest)
-        rows, sums = np.empty(count, np.float32), np.empty((3, c.averages[0].shape[1]), np.float32)
+        sums = np.empty((3, c.averages[0].shape[1]), np.float32)
         near, fields, work = (
             np.empty((7, 3 * count), np.float32),
             np.empty((6, count), np.float32),
@@ -187,8 +187,8 @@ def _entries(sources: str) -> Any:
             for d in range(count):
                 for a in range(2):
                     flow[a, d] = centre[b, d, a] - c.rest[d, a]
-            _gradient(c.averages, confidence, flow, strain[b], rows, sums, gradient)
-            _along(c.averages, confidence, flow, gradient, fields, rows, near, predicted)
+            _gradient(c.averages, confidence, flow, strain[b], sums, gradient)
+            _along(c.averages, confidence, flow, gradient, fields, near, predicted)
             for d in range(count):
                 u, v = c.rest[d, 0] + predicted[0, d], c.rest[d, 1] + predicted[1, d]
                 confidence[d] *= u > -0.5 and u < size[0] - 0.5 and v > -0.5 and v < size[1] - 0.5
