@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators.force_balance import gauss_newton
+from torchmembrane.estimators.force_balance import gauss_newton, schedule
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import State
 from torchmembrane.estimators.force_balance.kernels import steps as native
@@ -197,8 +197,8 @@ def test_a_schedule_is_that_of_tensor_operations(steps, tol, settle):
 
 def test_every_setting_is_heard_of():
     """Each changes a step, as it changes that of tensor operations."""
-    changed = dict(shear=2.0, slip=0.2, sparsity=900.0, floor=0.1, scale_share=0.9, far_share=0.8, contact_noise=220.0)
-    changed |= dict(camera_motion=0.5, largest_stretch=1e-3, outlier=9.0)
+    changed = dict(shear=2.0, tau=(4.0, 0.45), sparsity=900.0, floor=0.1, scale_share=0.9, contact_noise=220.0)
+    changed |= dict(camera_motion=0.5, outlier=9.0)
     balance = estimator()
     given = problem(balance)
     usual = taken(balance, *given, 0.5)[0]
@@ -208,6 +208,20 @@ def test_every_setting_is_heard_of():
         found = taken(other, *given, 0.5)
         assert_same(found, expected(other, *given, 0.5))
         assert float((found[0] - usual).abs().max()) > 1e-6 * float(usual.abs().max()), name
+
+
+def test_no_step_stretches_an_edge_by_more_than_its_limit(monkeypatch):
+    monkeypatch.setattr(schedule, "LARGEST_STRETCH", 1e-3)
+    balance = estimator()
+    given = problem(balance)
+    found = taken(balance, *given, 0.5)
+    assert_same(found, expected(balance, *given, 0.5))
+    rest, grid = balance.membrane.rest.double(), balance.membrane.grid
+    edges = [(x + rest).unflatten(1, grid).diff(dim=axis) for x in (given[0].u.double(), found[0].double()) for axis in (1, 2)]
+    stretch = max(
+        ((after - before).norm(dim=-1) / before.norm(dim=-1)).max() for before, after in zip(edges[:2], edges[2:], strict=True)
+    )
+    assert 0.9e-3 < float(stretch) < 1.001e-3
 
 
 def test_a_frame_alone_is_that_of_a_batch_to_the_last_digit():

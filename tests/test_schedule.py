@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.force_balance import schedule
 from torchmembrane.estimators.force_balance.estimator import LOSS_OF_NOISE, ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import State
 from torchmembrane.estimators.force_balance.robust import Cauchy
@@ -73,7 +74,7 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
     after = one.gauss_newton.step(start, measured, tau, torch.ones_like(tau))
     before, now = edges(x, DOME), edges(one.membrane.rest + after.u, DOME)
     share = ((now - before).norm(dim=-1) / before.norm(dim=-1)).amax(-1)
-    assert (share < SETTINGS.largest_stretch * (1 + 1e-6)).all() and (share > 0.01).all()
+    assert (share < schedule.LARGEST_STRETCH * (1 + 1e-6)).all() and (share > 0.01).all()
 
 
 def test_the_scale_falls_slowly_while_the_surface_moves_and_fast_where_it_stands_still():
@@ -288,8 +289,8 @@ def test_a_solution_has_converged_if_its_last_step_was_short_and_its_volume_is_k
     one = estimator()
     found = one(dented)
     found = type(found)(*(value[:1].repeat(5, *[1] * (value.ndim - 1)) for value in found))
-    step = SETTINGS.largest_relative_step * torch.tensor([0.99, 1.01, 0.0, 0.0, 0.0]).double()
-    off = SETTINGS.largest_volume_error * torch.tensor([0.0, 0.0, 0.99, 1.01, -1.01]).double()
+    step = SETTINGS.convergence_tol * torch.tensor([0.99, 1.01, 0.0, 0.0, 0.0]).double()
+    off = SETTINGS.convergence_tol * torch.tensor([0.0, 0.0, 0.99, 1.01, -1.01]).double()
     found = found._replace(relative_step=step, volume=one.membrane.rest_volume * (1 + off))
     assert one.is_converged(found).tolist() == [True, False, True, False, False]
 

@@ -12,7 +12,14 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.marker_residuals import MeasuredRays
 from torchmembrane.estimators.force_balance.robust import Cauchy
-from torchmembrane.estimators.force_balance.schedule import LEAST_MOVE, falling, outlier_scale, scaled_step, share_of_next
+from torchmembrane.estimators.force_balance.schedule import (
+    LARGEST_STRETCH,
+    LEAST_MOVE,
+    falling,
+    outlier_scale,
+    scaled_step,
+    share_of_next,
+)
 from torchmembrane.solve.stencil import inner, pad_border
 from torchmembrane.surface.topology import corners, triangles_of
 
@@ -98,5 +105,5 @@ class BalanceTwin:
         for axis in (0, 1):
             edge, turn = (np.linalg.norm(np.diff(a, axis=axis), axis=-1) for a in (surface, change))
             stretch = max(stretch, (turn / edge).max())
-        share *= min(1.0, e.settings.largest_stretch / max(stretch, 1e-12))
+        share *= min(1.0, LARGEST_STRETCH / max(stretch, 1e-12))
         return u + share * torch.from_numpy(move), pressure + share * rise

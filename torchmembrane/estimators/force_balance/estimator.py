@@ -258,8 +258,8 @@ class ForceBalance(Estimator):
     def is_converged(self, found: Equilibrium) -> Tensor:
         """Return where the last step was short and the volume fulfils the cavity's law, `[B]` bool. A step of which only a part
         was taken may be short and leave the law unfulfilled."""
-        error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
-        return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
+        error, tol = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings.convergence_tol
+        return ~((found.relative_step > tol) | (error > tol))
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """Return where a surface of this sensor explains the markers, `[B]` bool: the objective without pushes, the misfit that

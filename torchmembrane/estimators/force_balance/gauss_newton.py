@@ -13,6 +13,7 @@ from ...mechanics.cavity import CavityLaw
 from ...solve.implicit import differentiable, differentiable_fixed_point, refined
 from ...solve.kkt import border_unknowns
 from ...solve.stencil import inner
+from . import schedule
 from .kernels.steps import NativeSteps
 from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
@@ -243,5 +244,5 @@ class GaussNewton(nn.Module):
         both = torch.stack([move, (self.membrane.rest + u).mT.unflatten(-1, self.membrane.grid)], 1)
         changes = [both.diff(dim=axis).square().sum(2).flatten(2).unbind(1) for axis in (-2, -1)]
         stretch2 = torch.cat([change2 / edge2.clamp_min(tiny) for change2, edge2 in changes], 1).amax(-1)
-        share: Tensor = (stretch2 / self.settings.largest_stretch**2).clamp_min(1.0).rsqrt()
+        share: Tensor = (stretch2 / schedule.LARGEST_STRETCH**2).clamp_min(1.0).rsqrt()
         return share

@@ -28,6 +28,8 @@ LEAST_MOVE = 1e-9
 """Relative displacement below which a surface stands still; keeps quotients finite."""
 TINY = 1e-30
 """Keeps quotients by a tolerance of zero finite."""
+LARGEST_STRETCH = 0.3
+"""Largest relative change of an edge of the grid in one step."""
 SETTLING_STEPS = 8
 """Number of relaxed steps for frames that have not settled before; at most half of all steps."""
 RELAXATION = 0.5

@@ -42,19 +42,16 @@ class ForceBalanceSettings:
         sparsity: twice the loss of the uniform compressive traction p0 on the whole surface, while the loss is quadratic.
         scale_share: share of the largest push (compressive traction) around a vertex, within `WIDER` times `reach`, below
             which a push is small.
-        far_share: the same as a share of the largest push on the whole surface.
         contact_noise: smallest ratio of a contact's push to the push due to noise; it must be large for its neighbourhood too.
         shear: weight of the loss of shear traction without a push, relative to that of compressive traction.
-        slip: scale of the loss of shear traction, above which it is linear.
         reach: radius of the neighbourhood that determines whether a vertex is pushed.
         floor: smallest weight of a compressive traction, between 0 and 1. Without it, the position of a vertex under a contact
             would be undetermined. `noise_share` follows from it.
         outlier: scale of the markers' loss, relative to their noise; larger on coarser grids of few lines.
         pressure_noise: standard deviation of a measured pressure, relative to the reference traction (mostly the rest
             pressure). Use this value for better gauges as well.
-        largest_stretch: largest relative change of an edge of the grid in one step.
-        largest_relative_step: largest rms of the last step of a converged solution.
-        largest_volume_error: largest volume error of a converged solution, relative to the rest volume.
+        convergence_tol: largest rms of the last step of a converged solution, and largest volume error, relative to the rest
+            volume.
         unexplained_per_displacement: largest objective without the normal-compression term, per marker seen, that a surface of
             this sensor explains, above `estimator.LOSS_OF_NOISE` and per rms displacement: the error of grid and material
             grows with the press.
@@ -74,17 +71,13 @@ class ForceBalanceSettings:
     camera_motion: float = 0.005
     sparsity: float = 9000.0
     scale_share: float = 0.2
-    far_share: float = 0.05
     contact_noise: float = 3.32
     shear: float = 3.75
-    slip: float = 0.05
     reach: float = 0.04
     floor: float = 1e-3
     outlier: float = 2.5
     pressure_noise: float = 0.01
-    largest_stretch: float = 0.3
-    largest_relative_step: float = 2e-3
-    largest_volume_error: float = 1e-3
+    convergence_tol: float = 1e-3
     unexplained_per_displacement: float = 40.0
     largest_shared_misfit: float = 1.35
 
@@ -96,6 +89,16 @@ class ForceBalanceSettings:
 
         if not 0 < self.floor < 1:
             raise MembraneError(f"ForceBalanceSettings: floor = {self.floor}; expected more than 0 and less than 1")
+
+    @property
+    def slip(self) -> float:
+        """Scale of the loss of shear traction, above which it is linear: small compared with the last scale of a push."""
+        return self.tau[1] / 8
+
+    @property
+    def far_share(self) -> float:
+        """Share of the largest push on the whole surface, however far away, below which a push is small."""
+        return self.scale_share / 4
 
     @property
     def noise_share(self) -> float:

@@ -161,6 +161,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         is_gas=cavity.filling == "gas",
         absolute=absolute,
         gas_volume=gas,
+        largest_stretch=schedule.LARGEST_STRETCH,
         **{name: float(getattr(settings, name)) for name in Numbers._fields if hasattr(settings, name)},
     )
 
