@@ -24,15 +24,12 @@ from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.uncertainty import spreads_by_tensors
 from torchmembrane.machine_code import kept, takes, using
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.solve import native_band
+from torchmembrane.solve import native_envelope
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
 PACKAGE = Path(native.__file__).parents[3]
-LOADS = 8
-BAND = native_band.factor_rows, native_band.forward, native_band.backward
-factor_rows, forward, backward = (numba.njit(function.py_func) for function in BAND)
 
 
 def estimator(model="neo_hookean", prestretch=1.3, filling="liquid", grid=(11, 9), hole=False):
@@ -359,61 +356,10 @@ def test_loads_that_a_step_does_not_have_are_zero():
     gauss_newton = balance.gauss_newton
     gauss_newton.native.spread(gauss_newton.equations, gauss_newton.cavity, state, measured, 2.5)
     (work,) = gauss_newton.native._idle[np.dtype(float)]
-    loads = work.y.reshape(-1, native_band.COLUMNS)
+    loads = work.y.reshape(-1, native_envelope.COLUMNS)
     assert loads[:, WANTED:LOADS_OF_DEVIATIONS].any(0).all() and not loads[:, LOADS_OF_DEVIATIONS:].any()
     taken(balance, state, measured)
     assert loads[:, :WANTED].any(0).all() and not loads[:, WANTED:].any()
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("unknowns, width", [(5, 3), (16, 7), (50, 20), (147, 50), (675, 98)])
-def test_a_band_is_factored_and_solved_as_the_dense_matrix(unknowns, width, dtype):
-    matrix, U, (size, stride) = band(unknowns, width, dtype)
-    y = np.zeros((size, native_band.COLUMNS), dtype)
-    loads = np.random.default_rng(1).normal(size=(unknowns, LOADS))
-    y[:unknowns, :LOADS] = loads
-    inverse = np.zeros(size, dtype)
-    assert is_factored(U, stride, width, inverse, y)
-    exact = np.linalg.solve(matrix, loads)
-    tolerance = 1e3 * np.finfo(dtype).eps
-    half = y[:unknowns, :LOADS].astype(float)
-    np.testing.assert_allclose(half.T @ half, loads.T @ exact, rtol=0, atol=tolerance * abs(loads.T @ exact).max())
-    first, again = y[:, 0].copy(), np.zeros(size, dtype)
-    again[:unknowns] = loads[:, 0]
-    forward(U, stride, width, inverse, again)
-    np.testing.assert_allclose(again, first, rtol=0, atol=tolerance)
-    backward(U, stride, width, inverse, first)
-    np.testing.assert_allclose(first[:unknowns], exact[:, 0], rtol=0, atol=tolerance)
-
-
-@pytest.mark.parametrize("row", [0, 1, 30, 49])
-@pytest.mark.parametrize("spoil", [-1.0, np.nan])
-def test_a_band_that_is_not_positive_has_no_factor(row, spoil):
-    _, U, (size, stride) = band(50, 20, np.float64)
-    U[native_band.PAD + row * (stride + 1)] = spoil
-    assert not is_factored(U, stride, 20, np.zeros(size), np.zeros((size, native_band.COLUMNS)))
-
-
-def is_factored(U, stride, width, inverse, y):
-    """Whether all rows of `U` become those of its factor."""
-    work = np.zeros(native_band.ROWS**2, U.dtype)
-    rows = range(0, len(inverse), native_band.ROWS)
-    return all(factor_rows(U, stride, width, first, inverse, y.reshape(-1), LOADS, work) for first in rows)
-
-
-def band(unknowns, width, dtype):
-    """A random positive matrix, dense, and as `native_band` stores it."""
-    size, stride = native_band.storage(unknowns, width)
-    generator = np.random.default_rng(0)
-    matrix, stored = np.zeros((unknowns, unknowns)), native_band.matrix(size, stride, np.dtype(dtype))
-    for r in range(size):
-        values = generator.normal(size=min(width + 1, max(unknowns - r, 1))) / (4 * width)
-        values[0] = 1.0
-        at = native_band.PAD + r * (stride + 1)
-        stored[at : at + len(values)] = values
-        if r < unknowns:
-            matrix[r, r : r + len(values)] = matrix[r : r + len(values), r] = values
-    return matrix, stored, (size, stride)
 
 
 def test_what_can_be_kept_nowhere_is_compiled_all_the_same():

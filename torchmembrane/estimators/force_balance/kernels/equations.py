@@ -12,12 +12,13 @@ import numpy as np
 from ....machine_code import aligned, compiled
 from ....mechanics.native_membrane import CELLS, STENCIL, Surface, places
 from ....solve.band import RIDGES
-from ....solve.native_band import COLUMNS, PAD, matrix, storage
+from ....solve.native_envelope import COLUMNS, first_column, matrix
 from ....solve.native_rows import sum_rows
 from ....solve.stencil_layouts import OFFSETS
 from ....vectors import BYTES, load, store
 from ..robust import geman_mcclure_curvature, geman_mcclure_weight
 from ..traction_loss import LEAST_SCALE, POWER, TINY
+from .layout import Layout, layout_of
 
 curvature_of_push, weight_of_push = compiled(geman_mcclure_curvature), compiled(geman_mcclure_weight)
 BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -1 for b in STENCIL) for a in STENCIL)
@@ -111,45 +112,37 @@ class Workspace(NamedTuple):
     jacobians: Any
     marker_weights: Any
     U: Any
-    """The matrix, and `inverse [3 N]` and its `scale [3 N]`, as `native_band` stores them."""
+    """The matrix as `native_envelope` stores it, and `inverse [3 N]` and its `scale [3 N]`. Unknowns are in the order of their
+    elimination in these, in `y` and in `half_solved [3 N]`; elsewhere they are in that of the vertices."""
     inverse: Any
     scale: Any
     loads: Any
     """`[11, 3 N]`"""
     y: Any
     """`[3 N x COLUMNS]`, the loads `b`, and then `U^-T b`."""
+    half_solved: Any
     solved: Any
     """`[3 N]`, the solution for a sum of the loads; `move [3 N]`, the negative step."""
     move: Any
     ridges: Any
     """`band.RIDGES`: a loop over an array is compiled once, over a tuple once for each of its numbers."""
-    columns: Any
-    """`[N, 10]`: of a vertex and a block, the block's first column; -1 where there is no such vertex."""
-    width: int
-    """Diagonals of the matrix above the main one; `stride`: as in `native_band`."""
-    stride: int
+    layout: Layout
 
 
 def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     """Return the arrays for a grid and a number of markers."""
     m, n = grid
     N, P = (m - 2) * (n - 2), places(m, n)
-    width = 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
-    size, stride = storage(3 * N, width)
+    layout = layout_of(m - 2, n - 2)
+    size = len(layout.places.begins)
     shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, P), x=(3, P), cells=(CELLS, P), W=(3, 3, P))
     shapes |= dict(weighted=(3, 21, P), of_loads=(3, 2, P))
     shapes |= dict(sums=(90, P), normal=(N, 3), fields=(5, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
-    shapes |= dict(marker_weights=(markers,), inverse=(size,), scale=(size,), solved=(size,), move=(size,), loads=(LOADS, size))
+    shapes |= dict(marker_weights=(markers,), inverse=(size,), scale=(size,), loads=(LOADS, size))
+    shapes |= dict(half_solved=(size,), solved=(size,), move=(size,))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
-    arrays |= dict(U=matrix(size, stride, dtype), y=aligned(size * COLUMNS, dtype), ridges=np.array(RIDGES, dtype))
-    return Workspace(columns=_columns(m - 2, n - 2), width=width, stride=stride, **arrays)
-
-
-def _columns(lines: int, across: int) -> np.ndarray:
-    """Return the first columns of the blocks, `[N, 10]`."""
-    (i, j), (further, beside) = np.indices((lines, across)).reshape(2, -1, 1), np.array(OFFSETS).T
-    there = (i + further < lines) & (j + beside >= 0) & (j + beside < across)
-    return np.where(there, 3 * ((i + further) * across + j + beside), -1)
+    arrays |= dict(U=matrix(layout.places, dtype), y=aligned(size * COLUMNS, dtype), ridges=np.array(RIDGES, dtype))
+    return Workspace(layout=layout, **arrays)
 
 
 @compiled
@@ -315,33 +308,35 @@ def sum_blocks(c, work):
 @compiled
 def scale_rows(c, work, damping):
     """Compute the `scale` that makes the matrix's diagonal 1."""
-    (m, n), sums, scale = c.surface.free.shape, work.sums, work.scale
+    n, sums, scale, order = c.surface.free.shape[1], work.sums, work.scale, work.layout.order
     scale[:] = 1
-    for k in range((m - 2) * (n - 2)):
-        at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
+    for k in range(len(order)):
+        at = (order[k] // (n - 2) + 1) * n + order[k] % (n - 2) + 1
         for a in range(3):
             if sums[4 * a, at] > 0:
                 scale[3 * k + a] = 1 / np.sqrt(sums[4 * a, at] * (1 + damping))
 
 
 @compiled
-def write_vertices(c, work, first, end, ridge, used):
-    """Write the rows of the vertices from `first` up to `end`: those of the matrix of the blocks to `U`, and those of the first
-    `used` loads to `y`. They are scaled by `scale`, and the ridge is added to the diagonal. The rows behind those of the last
-    vertex are zero but on the diagonal."""
-    n, U, sums, scale, stride = c.surface.free.shape[1], work.U, work.sums, work.scale, work.stride
+def write_vertices(work, first, end, ridge, used):
+    """Write the rows of the vertices from `first` up to `end`, in the order of elimination: those of the matrix of the blocks
+    to `U`, and those of the first `used` loads to `y`. They are scaled by `scale`, and the ridge is added to the diagonal. The
+    rows behind those of the last vertex are zero but on the diagonal."""
+    U, sums, scale, layout, y = work.U, work.sums, work.scale, work.layout, work.y
+    N, begins, ends = len(layout.order), layout.places.begins, layout.places.ends
     for k in range(first, end):
-        row, at = 3 * k, (k // (n - 2) + 1) * n + k % (n - 2) + 1
-        U[row * (stride + 1) + 1 : (row + 3) * (stride + 1) + 1] = 0
-        for block in range(10 if k < len(work.columns) else 0):
-            column = work.columns[k, block]
-            for a in range(3 if column >= 0 else 0):
-                start = PAD + (row + a) * stride + column
-                for b in range(3):
-                    U[start + b] = sums[9 * block + 3 * a + b, at] * scale[row + a] * scale[column + b]
+        row = 3 * k
         for r in range(row, min(row + 3, len(scale))):
-            U[PAD + r * (stride + 1)] = 1 + ridge
-            of_row = work.y[r * COLUMNS : (r + 1) * COLUMNS]
-            of_row[used:] = 0
-            for of_load in range(used):
-                of_row[of_load] = work.loads[of_load, r] * scale[r]
+            U[begins[r] + first_column(r) : begins[r] + ends[r]] = 0
+            y[r * COLUMNS : (r + 1) * COLUMNS] = 0
+        for block in range(layout.columns.shape[1] if k < N else 0):
+            column, at, source = layout.columns[k, block], layout.owners[k, block], 9 * layout.sources[k, block]
+            by_row, by_column = (1, 3) if layout.is_turned[k, block] else (3, 1)
+            for a in range(3 if column >= 0 else 0):
+                start = begins[row + a] + column
+                for b in range(a if column == row else 0, 3):  # what lies before the diagonal has no room
+                    U[start + b] = sums[source + by_row * a + by_column * b, at] * scale[row + a] * scale[column + b]
+        for r in range(row, min(row + 3, len(scale))):
+            U[begins[r] + r] = 1 + ridge
+            for of_load in range(used if k < N else 0):
+                y[r * COLUMNS + of_load] = work.loads[of_load, 3 * layout.order[k] + r - row] * scale[r]

@@ -9,7 +9,7 @@ import numpy as np
 from ....machine_code import compiled
 from ....mechanics.cavity import gas_law_step
 from ....mechanics.native_membrane import linearise
-from ....solve.native_band import COLUMNS, ROWS, backward, factor_rows, forward, subtract_products
+from ....solve.native_envelope import COLUMNS, ROWS, backward, factor_rows, forward, subtract_products
 from ....solve.symmetric_2x2 import symmetric_solution
 from ....vectors import BYTES
 from ..camera_motion import camera_stiffness
@@ -144,38 +144,41 @@ def factored(c, work, damping, used):
     while not found and tried < len(work.ridges):
         first, found = 0, True
         while found and first < len(work.scale):
-            write_vertices(c, work, -(-first // 3), -(-(first + ROWS) // 3), work.ridges[tried], used)
-            found = factor_rows(work.U, work.stride, work.width, first, work.inverse, work.y, used, R)
+            write_vertices(work, -(-first // 3), -(-(first + ROWS) // 3), work.ridges[tried], used)
+            found = factor_rows(work.U, work.layout.places, first, work.inverse, work.y, used, R)
             first += ROWS
         tried += 1
     if not found:
         work.y[:] = np.nan
-    return _products(work.y, used)
+    return _products(work, used)
 
 
 @compiled
 def resolved(work):
     """Solve `U^T y = b` again for the load of the forces alone, and return the products as `factored` does."""
-    for i in range(len(work.scale)):
-        work.solved[i] = work.loads[FORCES, i] * work.scale[i]
-    forward(work.U, work.stride, work.width, work.inverse, work.solved)
-    for i in range(len(work.scale)):
-        work.y[i * COLUMNS + FORCES] = work.solved[i]
-    return _products(work.y, np.intp(WANTED))
+    half, order = work.half_solved, work.layout.order
+    half[3 * len(order) :] = 0
+    for k in range(len(order)):
+        for a in range(3):
+            half[3 * k + a] = work.loads[FORCES, 3 * order[k] + a] * work.scale[3 * k + a]
+    forward(work.U, work.layout.places, work.inverse, half)
+    for i in range(len(half)):
+        work.y[i * COLUMNS + FORCES] = half[i]
+    return _products(work, np.intp(WANTED))
 
 
 @compiled
-def _products(y, used):
+def _products(work, used):
     """Return the products of the first `used` columns of `y [3 N, COLUMNS]`, `[COLUMNS, COLUMNS]`. Those of `PART` rows are
     summed at a time."""
-    products, lanes = np.zeros((COLUMNS, COLUMNS)), BYTES // y.itemsize
-    part, rows = np.empty(COLUMNS * COLUMNS, y.dtype), len(y) // COLUMNS
-    for first in range(0, rows, PART):
+    y, of_rows, products = work.y, work.layout.places.loads, np.zeros((COLUMNS, COLUMNS))
+    part, lanes = np.empty(COLUMNS * COLUMNS, y.dtype), BYTES // y.itemsize
+    for first in range(0, len(of_rows), PART):
         part[:] = 0
-        count, at = min(PART, rows - first), first * COLUMNS
+        end = min(first + PART, len(of_rows))
         for a in range(0, used, ROWS):
             for b in range(0, used, lanes):
-                subtract_products(part, a * COLUMNS + b, COLUMNS, y, at + a, COLUMNS, y, at + b, COLUMNS, count)
+                subtract_products(part, a * COLUMNS + b, COLUMNS, y, of_rows, a, y, of_rows, b, first, end)
         for a in range(used):
             for b in range(used):
                 products[a, b] -= part[a * COLUMNS + b]
@@ -185,14 +188,16 @@ def _products(y, used):
 @compiled
 def substituted(work, shares):
     """Solve `M x = sum_l shares[l] b_l` and write x to `solved [3 N]`; `factored` has written `U^-T b_l` to `y`."""
-    for i in range(len(work.scale)):
+    half, order = work.half_solved, work.layout.order
+    for i in range(len(half)):
         total = shares[0] * work.y[i * COLUMNS]
         for load in range(1, len(shares)):
             total += shares[load] * work.y[i * COLUMNS + load]
-        work.solved[i] = total
-    backward(work.U, work.stride, work.width, work.inverse, work.solved)
-    for i in range(len(work.scale)):
-        work.solved[i] *= work.scale[i]
+        half[i] = total
+    backward(work.U, work.layout.places, work.inverse, half)
+    for k in range(len(order)):
+        for a in range(3):
+            work.solved[3 * order[k] + a] = half[3 * k + a] * work.scale[3 * k + a]
 
 
 @compiled

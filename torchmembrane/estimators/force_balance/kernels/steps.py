@@ -13,14 +13,14 @@ from ....machine_code import Kept, fingerprint, in_threads, kept
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
 from ....mechanics.native_membrane import Surface, surface_of
-from ....solve import native_band, native_rows, symmetric_2x2
+from ....solve import native_envelope, native_rows, symmetric_2x2
 from ....solve.native_rows import within
 from ....solve.stencil import inner
 from .. import camera_motion, robust, schedule
 from ..marker_residuals import MeasuredRays
 from ..normal_equations import DAMPING, BalanceEquations
 from ..schedule import settling_of
-from . import equations, gauss_newton, markers, solution, spread
+from . import equations, gauss_newton, layout, markers, solution, spread
 from .equations import Constants, Numbers, Workspace, workspace
 from .gauss_newton import settle
 from .solution import TOLD, solution_of
@@ -251,11 +251,8 @@ def _entry(sources: str) -> Any:
     return frames
 
 
-SOURCES = fingerprint(
-    __file__,
-    *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, markers, native_band, native_membrane)),
-    *(each.__file__ for each in (native_rows, robust, schedule, solution, spread, symmetric_2x2, vectors)),
-)
+USED = camera_motion, cavity, equations, gauss_newton, layout, markers, native_envelope, native_membrane, native_rows, robust
+SOURCES = fingerprint(__file__, *(each.__file__ for each in (*USED, schedule, solution, spread, symmetric_2x2, vectors)))
 frames = _entry(SOURCES)
 compiled = Kept(frames, SOURCES)
 """For which precisions `frames` has been compiled."""
