@@ -69,6 +69,25 @@ def test_a_view_that_moves_is_named_and_taken_for_rest(stream):
     assert float((pressed.vertices - unmoved.vertices).norm(dim=-1).max()) < 0.05
 
 
+@pytest.mark.parametrize("is_blank", [True, False])
+def test_a_view_without_a_picture_keeps_its_rest_state(stream, is_blank):
+    """The other one, which has moved by a pixel, is taken for rest."""
+    reconstructor, (left, right), frames = stream
+    observer, tracker = reconstructor.observer, tm.Tracker(reconstructor)
+    with pytest.warns(UserWarning, match="view right: rest image 0: .*; this view keeps the rest state of its rest image"):
+        tracker.rezero([np.roll(left, 1, axis=1), np.zeros_like(right) if is_blank else None])
+    (moved,) = observer.by_view((tracker._rest_pixels - observer.measured_rest)[None])
+    assert torch.equal(moved[1], torch.zeros_like(moved[1]))
+    torch.testing.assert_close(moved[0].median(0).values, torch.tensor([1.0, 0.0]), rtol=0, atol=0.05)
+    assert tracker([np.roll(frames[1][0], 1, axis=1), frames[1][1]]).status.tolist() == [tm.Status.OK]
+
+
+def test_a_frame_without_any_picture_is_no_rest_state_of_any_view(stream):
+    reconstructor, rest, _ = stream
+    with pytest.raises(tm.MembraneError, match="view left: rest image 0: .*; view right: rest image 0: "):
+        tm.Tracker(reconstructor).rezero([np.zeros_like(image) for image in rest])
+
+
 def watch_of(views, generator):
     """A watch over views of 40 markers each, and their pixels."""
     pixels = [torch.rand(40, 2, generator=generator).double() * torch.tensor(SIZES[w]) for w in views]

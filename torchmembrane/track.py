@@ -116,11 +116,11 @@ class Tracker:
         """Compile the machine code now, if it is not compiled yet, so that the first frame does not wait for it; this takes a
         minute or more (`machine_code`). The tracker's state does not change."""
         r = self.reconstructor
-        images = [torch.zeros(height, width) for width, height in r.camera.image_sizes if r.sensor.views_apart]
+        images = [r.rest_pixels.new_zeros(height, width) for width, height in r.camera.image_sizes if r.sensor.views_apart]
         width, height = r.image_size
         with torch.no_grad():
             r.from_pixels(r.rest_pixels)
-            r(images or torch.zeros(height, width))
+            r(images or r.rest_pixels.new_zeros(height, width))
 
     def reset(self) -> None:
         """Forget the preceding frames, the rest state set by `rezero`, the drift and the time."""
@@ -197,11 +197,12 @@ class Tracker:
         """Use a frame without contact, by default the latest, as the new rest state, which removes the drift since the rest
         image.
 
-        Markers that are not found in it keep their pixels in the sensor's rest image. If a contact is found in the frame, the
+        Markers that are not found in it keep their pixels in the sensor's rest image; so do, with a warning, those of a view
+        that does not show them, if another view does. If a contact is found in the frame, the
         frame is used all the same, because a drift may look like a contact, and a warning states the contact's force.
 
         Raises:
-            MembraneError: there is no frame yet, or too few markers are found in it.
+            MembraneError: there is no frame yet, or too few markers are found in it, in every view.
         """
         images, result = self._latest, self._latest_result
         if frame is not None:

@@ -15,6 +15,7 @@ from ..control_flow import Value, traced
 from ..errors import MembraneError
 from ..files.tensors import tensor_of
 from ..results.status import Status
+from ..user_warnings import warn_user
 from .observer import MarkerFlow, MarkerObserver, RestState
 
 BY_GRAVITY = (Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UNLIKE_REST)
@@ -162,8 +163,23 @@ class ViewsObserver(nn.Module):
         return flow._replace(status=torch.where(fails.all(1), gravest, left_out))
 
     def rest_of(self, images: Tensor) -> RestState:
-        """Return the markers of all sightings in grey images without contact, as `MarkerObserver.rest_of`."""
-        rests = [observer.rest_of(part) for observer, part in zip(self.each, self.images(images), strict=True)]  # type: ignore[operator]
+        """Return the markers of all sightings in grey images without contact, as `MarkerObserver.rest_of`. A view whose images
+        do not show the markers keeps those of its rest image, with a warning.
+
+        Raises:
+            MembraneError: the images of no view show the markers.
+        """
+        rests, failed = [], []
+        for name, observer, part in zip(self.names, self.each, self.images(images), strict=True):
+            try:
+                rests.append(observer.rest_of(part))  # type: ignore[operator]
+            except MembraneError as error:
+                rests.append(RestState(observer.measured_rest, observer.rest_covariance))  # type: ignore[arg-type]
+                failed.append(f"view {name}: {error}")
+        if len(failed) == self.views:
+            raise MembraneError("; ".join(failed))
+        for said in failed:
+            warn_user(f"{said}; this view keeps the rest state of its rest image")
         return RestState(*map(torch.cat, zip(*rests, strict=True)))
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
