@@ -223,6 +223,15 @@ def test_a_list_and_a_stack_are_the_same(reconstructor, found, press):
             reconstructor(wrong)
 
 
+def test_a_stack_of_views_may_be_any_array(reconstructor, press):
+    """Of reversed axes, and of another byte order, as files of other machines have it."""
+    images = np.stack(press[1])
+    expected = reconstructor(images)
+    for array in (images[:, ::-1].copy()[:, ::-1], images.astype(">u2") * 257):
+        found = reconstructor(array)
+        torch.testing.assert_close(found.vertices, expected.vertices, rtol=0, atol=1e-5)
+
+
 def test_the_order_of_the_views_does_not_matter(press, found):
     """The other view as the first: the same surface in that view's frame."""
     simulator, images, truth, state = press

@@ -45,7 +45,7 @@ def to_grayscale_batch(
         >>> list(to_grayscale_batch(photograph, (640, 480), "bgr", torch.zeros(())).shape)
         [1, 1, 480, 640]
     """
-    pixels = _tensor(images)
+    pixels = image_tensor(images)
     if not (pixels.is_floating_point() or pixels.dtype in STORED_BITS):
         raise MembraneError(f"images of type {pixels.dtype}; expected uint8, uint16, or float in 0..1")
     planes = _planes(pixels, (size[1], size[0]))
@@ -83,7 +83,16 @@ def check_image(name: str, image: np.ndarray, size: tuple[int, int] | None = Non
     return array
 
 
-def _tensor(images: Tensor | np.ndarray) -> Tensor:
+def image_tensor(images: Tensor | np.ndarray) -> Tensor:
+    """Return images as a tensor on their own device, with their values; an array may have any strides and byte order.
+
+    Raises:
+        MembraneError: torch has no such type.
+
+    Example:
+        >>> image_tensor(np.arange(3.0, dtype=">f4")[::-1]).tolist()
+        [2.0, 1.0, 0.0]
+    """
     if isinstance(images, Tensor):
         return images
     array = np.asarray(images)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..files.grayscale import Channels, to_grayscale_batch
+from ..files.grayscale import Channels, image_tensor, to_grayscale_batch
 from ..files.images import IMAGES, VIDEOS, read_image
 from .views import View
 
@@ -41,7 +41,7 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
     """
     count = len(views)
     if not isinstance(images, list | tuple):
-        stacked = torch.as_tensor(images) if not isinstance(images, Tensor) else images
+        stacked = image_tensor(images)
         has_colours = stacked.ndim >= 4 and stacked.shape[-1] == 3
         axis = stacked.ndim - 3 - has_colours
         if axis not in (0, 1) or stacked.shape[axis] != count:
