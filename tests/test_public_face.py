@@ -115,15 +115,28 @@ def test_wrong_words_are_refused(sensor):
 
 
 def test_half_precision_images_are_taken_and_half_precision_modules_are_not(sensor, photographs, result):
+    """Alone or in a model; what is refused changes nothing, because no later `.float()` could undo it."""
     made = tm.Reconstructor(sensor)
-    images = torch.from_numpy(photographs / 255.0)
+    model = torch.nn.ModuleDict({"eye": made, "head": torch.nn.Linear(6, 1)})
+    images, refused = torch.from_numpy(photographs / 255.0), "convert the other parts of a model only"
     with torch.no_grad():
-        got = made(images.half())
-        with pytest.raises(tm.MembraneError, match=r"call \.float\(\)"):
-            made.half()(images)
+        got, expected = made(images.half()), made(images)
+        for convert in (
+            made.half,
+            made.bfloat16,
+            model.half,
+            lambda: model.to("cpu", torch.bfloat16),
+            lambda: made.type(torch.half),
+        ):
+            with pytest.raises(tm.MembraneError, match=refused):
+                convert()
+        for one, other in zip(made.float()(images), expected, strict=True):
+            assert torch.equal(one.nan_to_num(), other.nan_to_num())
     assert (got.vertices - result.vertices).abs().max() < 0.02
-    with pytest.raises(tm.MembraneError, match=r"call \.float\(\)"):
-        made.from_pixels(made.rest_pixels)
+    made.observer.half()
+    for call in (lambda: made(images), lambda: made.from_pixels(made.rest_pixels)):
+        with pytest.raises(tm.MembraneError, match=refused):
+            call()
 
 
 @pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])

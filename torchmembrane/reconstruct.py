@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from .camera.rig import turns_by_noise
 from .control_flow import can_sync, in_inference_mode, traced
 from .errors import MembraneError, check_arguments, expect
 from .estimators.base import Equilibrium, Estimator, Observation, StandardDeviations
 from .estimators.contacts import Contacts
-from .estimators.precision import PRECISIONS, check_precision, full_precision
+from .estimators.precision import PRECISIONS, FullPrecision, full_precision
 from .estimators.registry import built_estimator, estimator_kind, refuse_unfit
 from .estimators.sensor_problem import LEAST_ERROR, problem_of
 from .files.grayscale import CHANNELS, Channels, to_grayscale_batch
@@ -38,7 +38,7 @@ MODEL_ERROR = 0.004  # error of the model's marker positions, over the rms displ
 LARGEST_RESIDUAL = 1.5  # px, largest residual of a plausible solution, however noisy the image
 
 
-class Reconstructor(nn.Module):
+class Reconstructor(FullPrecision):
     """Reconstructs surfaces from the images of one sensor, or with `from_pixels` from markers located elsewhere.
 
     Args:
@@ -177,8 +177,7 @@ class Reconstructor(nn.Module):
             MembraneError: the size, shape or type is wrong, `previous` belongs to another batch or sensor, or a pressure is
                 given for an open cavity or for another estimator.
         """
-        check_precision(self.rest_pixels.dtype)
-        with full_precision(self.rest_pixels.device.type):
+        with full_precision(self.rest_pixels):
             grey = self.grey(images)
             before = None if previous is None else self.observer.before(previous, len(grey))
             rest = None if rest_pixels is None else self.observer.rest_given(rest_pixels)
@@ -221,8 +220,7 @@ class Reconstructor(nn.Module):
         Raises:
             MembraneError: the shape is wrong, or a confidence lies outside 0..1.
         """
-        check_precision(self.rest_pixels.dtype)
-        with full_precision(self.rest_pixels.device.type):
+        with full_precision(self.rest_pixels):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels, noise)
             return in_inference_mode(self._solve, flow, pressure)
 

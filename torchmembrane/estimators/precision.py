@@ -1,17 +1,31 @@
 """Floating-point precision of the solvers."""
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from typing import Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..errors import MembraneError
 
 PRECISIONS = (torch.float32, torch.float64)
 
 
-def full_precision(device: str) -> AbstractContextManager[object]:
-    """Return a context that disables autocast on devices that have it."""
+class FullPrecision(nn.Module):
+    """A module that refuses half precision before it rounds the constants, because `.float()` would not restore them."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Convert the constants, as `.to`, `.double()` and the same methods of a module around this one do."""
+        check_precision(fn(torch.empty(0, dtype=torch.float32, device="cpu")).dtype)
+        converted: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        return converted
+
+
+def full_precision(like: Tensor) -> AbstractContextManager[object]:
+    """Return a context without autocast on the device of a tensor, whose precision is checked."""
+    check_precision(like.dtype)
+    device = like.device.type
     return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
 
 
@@ -19,8 +33,8 @@ def check_precision(dtype: torch.dtype) -> None:
     """Refuse a precision other than float32 and float64."""
     if dtype not in PRECISIONS:
         raise MembraneError(
-            f"Reconstructor: {dtype} is not accurate enough for the solver; expected torch.float32 or torch.float64: call "
-            ".float() (images may have half precision)"
+            f"Reconstructor: {dtype} is not accurate enough for the solver; expected torch.float32 or torch.float64: "
+            "convert the other parts of a model only (images may have half precision)"
         )
 
 
