@@ -33,6 +33,7 @@ from .sensor.view_images import grey_views, read_views
 from .state_dict import drop_derived_buffers
 from .surface.bicubic import bicubic_shares
 from .surface.levers import Levers
+from .torch_modes import on_cpu
 
 MODEL_ERROR = 0.004  # error of the model's marker positions, over the rms displacement of all markers
 LARGEST_RESIDUAL = 1.5  # px, largest residual of a plausible solution, however noisy the image
@@ -70,6 +71,7 @@ class Reconstructor(FullPrecision):
     marker_shares: Tensor
 
     @check_arguments
+    @on_cpu
     def __init__(
         self,
         sensor: Sensor,

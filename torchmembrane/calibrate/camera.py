@@ -11,6 +11,7 @@ from torch.func import functional_call, jacfwd, vmap
 from ..camera.model import Camera
 from ..camera.targets import Checkerboard, DotBoard
 from ..errors import MembraneError, check_arguments
+from ..torch_modes import on_cpu
 from .fit import LARGEST_NOISE, Fit, fit, outliers, outline_centres, rotations
 from .poses import lens_and_poses, port_pose
 
@@ -55,6 +56,7 @@ class CameraFit(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> CameraFit:
     """Fit focal lengths, centre and all distortion coefficients of the camera's model to views of a board in air.
 
@@ -94,6 +96,7 @@ def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> Camera
 
 
 @check_arguments
+@on_cpu
 def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequence[str] = ()) -> CameraFit:
     """Fit distance, thickness and refractive index of every port, and the medium's index, to views of a dot board.
 

@@ -13,6 +13,7 @@ from ..markers.placement import rim_mask
 from ..progress import Progress, silent, within
 from ..sensor.parts import Surface
 from ..sensor.sensor import Sensor
+from ..torch_modes import on_cpu
 from .surface import Correction, SurfaceProjection, correction, fine_surface, recalibrated, surface_projection
 from .view_poses import placed_view, rest_from_view_images
 from .views import placed_dots, with_dots_of_each_view
@@ -42,6 +43,7 @@ class DepthFit(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, progress: Progress = silent) -> DepthFit:
     """Find the rest surface in a depth image, and the dots on it in the rest image.
 
@@ -109,6 +111,7 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
     return DepthFit(moved, change, projection, deviations)
 
 
+@on_cpu
 def rest_from_depth_of_view(
     sensor: Sensor, number: int, depth: np.ndarray, images: Sequence[np.ndarray], *, progress: Progress = silent
 ) -> DepthFit:

@@ -142,7 +142,7 @@ def outline_centres(pixels: Tensor) -> Tensor:
     if count == 1:
         return mean
     p = pixels - mean[..., None, :]
-    gap = torch.arange(count, dtype=torch.float64)
+    gap = torch.arange(count, dtype=torch.float64, device=pixels.device)
     angle = torch.pi * (gap[:, None] - gap) / count
     derivative = torch.where(angle == 0, 0.0, torch.cos((gap[:, None] - gap) * torch.pi) / (2 * torch.tan(angle)))
     q = derivative @ p

@@ -20,6 +20,7 @@ from ..sensor.toml import MOST_DOTS, SIZES
 from ..sensor.units import millimetre
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
+from ..torch_modes import on_cpu
 from .fit import outline_centres
 from .surface import dot_outlines, fine_surface, surface_projection
 
@@ -51,6 +52,7 @@ class FabricationLayout(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     """Return a square lattice of alternating large and small dots in the image, centred at the principal point, within the rim.
 
@@ -90,6 +92,7 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
 
 
 @check_arguments
+@on_cpu
 def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> FabricationLayout:
     """Place dots on the rest surface such that the centroids of their outlines, seen through the ports, are at `pixels`.
 

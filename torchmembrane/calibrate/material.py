@@ -15,6 +15,7 @@ from ..reconstruct import Reconstructor
 from ..results.status import Status
 from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
+from ..torch_modes import on_cpu
 from .explained import HEIGHT_SHARE, ExplainedPresses, MeasuredPresses, coarse_reconstructor, explained, with_material
 from .known_modulus import (
     KnownForces,
@@ -72,6 +73,7 @@ class MaterialFit(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 def material_from_images(
     sensor: Sensor,
     images: Tensor,
@@ -117,6 +119,7 @@ def material_from_images(
 
 
 @check_arguments
+@on_cpu
 def material_from_pixels(
     sensor: Sensor,
     pixels: Tensor,

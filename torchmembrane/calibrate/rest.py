@@ -17,6 +17,7 @@ from ..progress import Progress, silent
 from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
+from ..torch_modes import on_cpu
 from ..user_warnings import warn_user
 from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_errors
 from .known_modulus import refuse_overpressure
@@ -51,6 +52,7 @@ class RestFit(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 def rest_from_image(
     sensor: Sensor, image: np.ndarray, overpressure: float | None = None, *, progress: Progress = silent
 ) -> RestFit:

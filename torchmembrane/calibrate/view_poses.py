@@ -18,6 +18,7 @@ from ..markers.placement import FEWEST_MARKERS, markers_in_view
 from ..pose import ViewPose
 from ..progress import Progress, silent, within
 from ..sensor.sensor import Sensor
+from ..torch_modes import on_cpu
 from .fit import fit, rotations
 from .rest import RestFit, rest_from_image
 from .surface import fine_surface
@@ -49,6 +50,7 @@ class RigFit(NamedTuple):
     further: list[RestFit]
 
 
+@on_cpu
 def rest_from_view_images(
     sensor: Sensor, images: Sequence[np.ndarray], overpressure: float | None = None, *, progress: Progress = silent
 ) -> RigFit:

@@ -23,6 +23,7 @@ from ..progress import Progress, silent, within
 from ..sensor.parts import Markers
 from ..sensor.sensor import Sensor
 from ..sensor.units import millimetre
+from ..torch_modes import on_cpu
 from .bundle import Bundle, bundle_adjusted
 from .fit import LARGEST_NOISE, Fit, rotations, with_common_errors
 from .rest import measured_outlines, shading_bias
@@ -82,6 +83,7 @@ def _dots_on_surface(sensor: Sensor, image: np.ndarray) -> tuple[np.ndarray, lis
 
 
 @check_arguments
+@on_cpu
 def rest_from_views(
     sensor: Sensor,
     images: Sequence[np.ndarray],

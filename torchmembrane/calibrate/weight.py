@@ -14,6 +14,7 @@ from ..reconstruct import Reconstructor
 from ..results.reconstruction import Reconstruction
 from ..results.status import Status
 from ..sensor.sensor import Sensor
+from ..torch_modes import on_cpu
 from .gauge import CONTRADICTION, UNSURE
 from .material import MaterialFit, material_from_images
 from .presses import GAS_ROUNDS
@@ -41,6 +42,7 @@ class WeightFit(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progress: Progress = silent) -> WeightFit:
     """Infer prestretch and modulus from images of presses by one known force.
 

@@ -30,9 +30,9 @@ def fold_in_image(camera: Camera) -> float:
     distortion, (width, height) = camera.distortion, camera.image_size
     if not len(distortion) or (camera.model == "fisheye" and float(fisheye_fold(distortion)) >= math.pi):
         return math.inf
-    u, v = (torch.linspace(-0.5, side - 0.5, DIRECTIONS).to(camera.centre) for side in (width, height))
+    u, v = (torch.linspace(-0.5, side - 0.5, DIRECTIONS, device="cpu").to(camera.centre) for side in (width, height))
     sides = [torch.cartesian_prod(u, v[[0, -1]]), torch.cartesian_prod(u[[0, -1]], v)]
-    steps = torch.linspace(0, 1, STEPS + 1).to(camera.centre)[1:, None, None]
+    steps = torch.linspace(0, 1, STEPS + 1, device="cpu").to(camera.centre)[1:, None, None]
     pixels = camera.centre + steps * (torch.cat(sides) - camera.centre)
     direction = pinhole_direction if camera.model == "pinhole" else fisheye_direction
     lost = direction((pixels - camera.centre) / camera.focal, distortion).isnan().any(-1)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ..errors import MembraneError, check_arguments, expect, is_number
 from ..files.decoder import MOST_PIXELS
 from ..files.levels import check_bits
+from ..torch_modes import on_cpu
 from .distortion import fisheye_direction, fisheye_image, pinhole_direction, pinhole_image
 from .mode import Mode
 from .motion import ImageMotion
@@ -50,6 +51,7 @@ class Rays(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 class Camera(ImageMotion, nn.Module):
     """A pinhole or fisheye camera, in air or looking through flat layers into a medium.
 

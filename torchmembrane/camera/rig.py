@@ -7,10 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from ..pose import ViewPose
+from ..torch_modes import on_cpu
 from .model import Camera, Rays
 from .motion import ImageMotion
 
 
+@on_cpu
 class Rig(ImageMotion, nn.Module):
     """Cameras that see the same markers; pixels and points are listed view by view, those of the first view first.
 

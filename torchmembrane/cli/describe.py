@@ -129,7 +129,7 @@ def _mode(mode: Mode) -> str:
 def _opening(camera: Camera, axis: int) -> float:
     """Return the angle of view through the image centre along a row (axis 0) or column (axis 1), degrees."""
     pixels = camera.centre.repeat(401, 1)
-    pixels[:, axis] = torch.linspace(-0.5, camera.image_size[axis] - 0.5, 401, dtype=pixels.dtype)
+    pixels[:, axis] = torch.linspace(-0.5, camera.image_size[axis] - 0.5, 401, dtype=pixels.dtype, device=pixels.device)
     direction = camera.pixel_to_ray(pixels).direction.numpy()
     return float(np.ptp(np.degrees(np.arctan2(direction[:, axis], direction[:, 2]))[np.isfinite(direction[:, 2])]))
 

@@ -172,7 +172,7 @@ def _body(arguments: Namespace, simulator: Simulator) -> Indenter:
     if kind == "wedge":
         return Wedge(_needed(arguments, "opening"), _needed(arguments, "radius"))
     if kind == "box":
-        return Box(torch.tensor(_needed(arguments, "sides"), dtype=torch.float64), _needed(arguments, "radius"))
+        return Box(torch.tensor(_needed(arguments, "sides"), dtype=torch.float64, device="cpu"), _needed(arguments, "radius"))
     if not Path(kind).is_file():
         raise MembraneError(f"--indenter {kind!r}: neither a file nor one of {', '.join(KINDS)}")
     mesh = MeshIndenter.read(kind)

@@ -26,7 +26,7 @@ def tensor_of(name: str, values: Any) -> Tensor:
     if isinstance(values, Tensor):
         given: Tensor | None = values
     elif isinstance(values, int | float) and is_number(values):
-        given = torch.tensor(float(values), dtype=torch.float64)
+        given = torch.tensor(float(values), dtype=torch.float64, device="cpu")
     else:
         given = _of_array(values)
     if given is None or given.is_complex():

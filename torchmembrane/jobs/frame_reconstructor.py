@@ -176,7 +176,7 @@ class FrameReconstructor:
         options: dict[str, Any] = {} if self.rest_pixels is None else {"rest_pixels": self.rest_pixels}
         if self.pressure is not None:
             readings = [self.reading(frame.name, frame.origin.time) for frame in group]
-            options["pressure"] = torch.tensor(readings, dtype=torch.float64)
+            options["pressure"] = torch.tensor(readings, dtype=torch.float64, device="cpu")
         computed = self.reconstructor(torch.cat(images), **options)
         results = Reconstruction(*(field.cpu() for field in computed))
         fields = self.reconstructor.fields(computed, self.fields) if self.fields else {}
@@ -198,7 +198,7 @@ class FrameReconstructor:
         """The empty result for a file whose image could not be read."""
         width, height = self.reconstructor.image_size
         channels = max(1, len(self.reconstructor.sensor.views_apart))
-        image = torch.zeros(1, channels, height, width).to(self.reconstructor.rest_pixels)
+        image = self.reconstructor.rest_pixels.new_zeros(1, channels, height, width)
         (frame,) = self._reconstructed([DecodedFrame("", Path(), image)])
         return frame | {"status": np.array(UNREADABLE, np.int32)}
 

@@ -160,7 +160,7 @@ def _portable(source: Source, reconstructor: "Reconstructor") -> Source:
 def _given(reason: str, image: object, lacking: dict[str, str], reconstructor: "Reconstructor") -> Loaded:
     if image is None:
         raise MembraneError(reason)
-    return Loaded(torch.as_tensor(image), lacking)
+    return Loaded(torch.as_tensor(image, device="cpu"), lacking)
 
 
 @contextmanager

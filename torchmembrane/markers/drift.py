@@ -99,7 +99,7 @@ class DriftWatch:
     def forget(self) -> None:
         """Start again."""
         self.frames, self.share, self.square = 0, 0.0, 0.0
-        self.mean = torch.zeros(len(self.fields), 2, dtype=torch.float64)
+        self.mean = self.fields.new_zeros(len(self.fields), 2)
         self.weight = torch.zeros_like(self.mean[:, :1])
         self.free: Tensor | None = None
 
@@ -173,6 +173,6 @@ class DriftWatch:
 def _polynomials(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Return the monomials of `pixels [D, 2]` about the image's centre, over half its longer side, `[D, T]`."""
     order = max(n for n in range(POLYNOMIAL_ORDER + 1) if n == 0 or MARKERS_PER_TERM * (n + 1) * (n + 2) / 2 <= len(pixels))
-    size = torch.tensor(image_size, dtype=pixels.dtype)
+    size = pixels.new_tensor(image_size)
     u, v = ((2 * pixels - size) / size.max()).unbind(-1)
     return torch.stack([u**i * v**j for i in range(order + 1) for j in range(order + 1 - i)], -1)

@@ -14,6 +14,7 @@ from ..errors import MembraneError
 from ..solve.stencil import apply_stencil, convolved, stencil_kernels
 from ..surface.membrane import Membrane
 from ..surface.topology import corners, triangles_of
+from ..torch_modes import on_cpu
 from .metric import (
     adjugate,
     cell_edges,
@@ -54,6 +55,7 @@ class Strain(NamedTuple):
     D: Tensor
 
 
+@on_cpu
 class ElasticEnergy(nn.Module):
     """The membrane's elastic energy `U(x)`, with its gradient, and its stiffness along given directions.
 

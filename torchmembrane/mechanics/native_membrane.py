@@ -82,7 +82,7 @@ def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Tensor, dtyp
         of_cells(elasticity.inverse_metric, 3, 2),
         of_cells(elasticity.det, 2),
         of_cells(elasticity.area, 2, elsewhere=0.0),
-        of_cells(torch.full((m - 1, n - 1), membrane.outward / 6, dtype=torch.float64), elsewhere=0.0),
+        of_cells(torch.full((m - 1, n - 1), membrane.outward / 6, dtype=torch.float64, device="cpu"), elsewhere=0.0),
         np.array(law, dtype),
     )
 

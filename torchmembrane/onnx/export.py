@@ -28,6 +28,7 @@ from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.status import Status
 from ..results.store import FORMATS, Mesh, Settings
+from ..torch_modes import on_cpu
 from .check import checked
 from .graph import Assembly, described, inlined
 from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
@@ -195,6 +196,7 @@ def _kind(example: Tensor) -> int:
 
 
 @check_arguments
+@on_cpu
 def export(
     reconstructor: Reconstructor,
     path: str | Path,

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..camera.model import Camera
 from ..errors import MembraneError, check_arguments
 from ..surface.membrane import Membrane
+from ..torch_modes import on_cpu
 
 LIGHTS, LIGHT_RADIUS = 4, 0.3  # default lights around the camera's centre, radius over the rim's mean distance from the axis
 LIGHT_WITHIN = 0.5  # largest distance of the lights from the camera, over the membrane's smallest distance from it
@@ -69,6 +70,7 @@ class Appearance:
             if value is not None and not low <= value <= high:
                 raise MembraneError(f"Appearance: {name} = {value}; expected a number from {low} to {high}")
 
+    @on_cpu
     def lights_for(self, membrane: Membrane) -> Tensor:
         """Return the positions `[L, 3]` of the lights in a sensor with this membrane."""
         if self.lights is not None:

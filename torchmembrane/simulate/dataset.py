@@ -12,6 +12,7 @@ import torch
 from ..errors import MembraneError
 from ..processes import begin_worker, spawned_pool
 from ..progress import Progress, silent
+from ..torch_modes import on_cpu
 from .frames import SimulatedFrames
 from .indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge, facing
 from .simulator import SimulatedFrame, Simulator, Stroke
@@ -109,6 +110,7 @@ def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator, se
     return stroke_to(simulator, body, X[target], travel, depth, turn=turn, friction=plan.friction)
 
 
+@on_cpu
 def stroke_to(
     simulator: Simulator,
     body: Indenter,

@@ -27,7 +27,9 @@ def draw_discs(image: Tensor, centres: Tensor, radii: Tensor, grey: Tensor) -> N
     for centre, radius, tone, start, end in zip(centres, radii, grey, starts, ends, strict=True):
         (left, top), (right, bottom) = start.long().tolist(), end.long().tolist()
         patch = image[top : bottom + 1, left : right + 1]
-        v, u = torch.meshgrid(*(torch.arange(low, high + 1) for low, high in ((top, bottom), (left, right))), indexing="ij")
+        v, u = torch.meshgrid(
+            *(torch.arange(low, high + 1, device=image.device) for low, high in ((top, bottom), (left, right))), indexing="ij"
+        )
         slope = torch.linalg.inv(radius.mT)
         place = (torch.stack([u, v], -1).flatten(0, 1).to(centre) - centre) @ slope.mT
         covered = inside_unit_disc(place, slope.expand(len(place), 2, 2)).view(patch.shape).to(patch)

@@ -208,7 +208,7 @@ class _SparsityPattern:
         V, free = len(membrane.rest), membrane.free_vertices.numpy()
         number = np.full(V, -1)
         number[free] = np.arange(len(free))
-        triangles = triangles_of(corners(torch.arange(V)[:, None], membrane.grid)).reshape(-1, 3).numpy()
+        triangles = triangles_of(corners(torch.arange(V, device="cpu")[:, None], membrane.grid)).reshape(-1, 3).numpy()
         groups = [number[triangles], np.arange(len(free))[:, None]]
         pairs = [_pairs(group, len(free)) for group in groups]
         entries, slots = np.unique(np.concatenate(pairs), return_inverse=True)

@@ -122,7 +122,7 @@ class FrictionalContact(NamedTuple):
     def linearised(self, active: ActiveSet, move: Tensor | float = 0.0) -> "FrictionalContact":
         """Return the contact with the forces of the linearised law on the active vertices after a `move [F, 3]`."""
         rigid, index, n, e = RIGID * self.weight, active.vertices, active.n, active.e
-        move = torch.broadcast_to(torch.as_tensor(move, dtype=n.dtype), self.tangential.shape)[index]
+        move = torch.broadcast_to(torch.as_tensor(move, dtype=n.dtype, device=n.device), self.tangential.shape)[index]
         normal = self.normal[index] - rigid * (active.phi + (n * move).sum(-1))
         if self.friction == 0:
             return self._with(index, normal, torch.zeros_like(n))
@@ -137,10 +137,10 @@ class FrictionalContact(NamedTuple):
         rigid, index, n, e = RIGID * self.weight, active.vertices, active.n, active.e
         blocks = rigid * _outer(n, n) - self.normal[index, None, None] * self._curvature(x[index])
         if self.friction:
-            plane = torch.eye(3, dtype=x.dtype) - _outer(n, n)
+            plane = torch.eye(3, dtype=x.dtype, device=x.device) - _outer(n, n)
             slips = self.friction * rigid * _outer(e, n) + active.turning[:, None, None] * (plane - _outer(e, e))
             blocks = blocks + torch.where(active.sticks[:, None, None], rigid * plane, slips)
-        return torch.zeros(len(x), 3, 3, dtype=x.dtype).index_copy(0, index, blocks)
+        return x.new_zeros(len(x), 3, 3).index_copy(0, index, blocks)
 
     def held(self, x: Tensor, active: ActiveSet) -> Tensor:
         """Return forces `[F, 3]` at `x` if no other vertex is in contact: N and T, less c times the penetration and the slip of
@@ -176,7 +176,7 @@ class FrictionalContact(NamedTuple):
         points = points.detach().requires_grad_()
         _, n = self.indenter.distance_and_normal(points)
         if not n.requires_grad:
-            return torch.zeros(*points.shape, 3, dtype=points.dtype)
+            return points.new_zeros(*points.shape, 3)
         rows = [torch.autograd.grad(n[:, i].sum(), points, retain_graph=True, materialize_grads=True)[0] for i in range(3)]
         return torch.stack(rows, 1)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..errors import MembraneError, check_arguments
 from ..files.tensors import tensor_of
 from ..surface.membrane import Membrane
+from ..torch_modes import on_cpu
 
 APPROACH_STEPS = 10_000
 
@@ -22,6 +23,7 @@ Vector = Tensor | np.ndarray | Sequence[float]
 
 
 @check_arguments
+@on_cpu
 def facing(direction: Vector) -> Tensor:
     """Return a rotation that turns a body's +z axis to a direction.
 
@@ -43,6 +45,7 @@ def facing(direction: Vector) -> Tensor:
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class Indenter:
     """A rigid body; subclasses define `local_distance(points [..., 3]) -> [...]` in the body's own frame.
@@ -155,6 +158,7 @@ class Indenter:
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class Sphere(Indenter):
     """A ball centred at the origin.
@@ -178,6 +182,7 @@ class Sphere(Indenter):
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class Plane(Indenter):
     """The half space `z <= 0`: a plate that presses along its outward normal, the third axis of its rotation.
@@ -192,6 +197,7 @@ class Plane(Indenter):
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class Cylinder(Indenter):
     """A cylinder about an axis through the origin.
@@ -227,6 +233,7 @@ class Cylinder(Indenter):
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class Wedge(Indenter):
     """A straight edge along x, with its tip at the origin pointing to +z.
@@ -250,13 +257,14 @@ class Wedge(Indenter):
             raise MembraneError(f"Wedge: opening = {self.opening}; expected degrees between 0 and 180")
 
     def local_distance(self, points: Tensor) -> Tensor:
-        half = torch.deg2rad(torch.as_tensor(self.opening / 2, dtype=points.dtype))
+        half = torch.deg2rad(torch.as_tensor(self.opening / 2, dtype=points.dtype, device=points.device))
         y, z = points[..., 1].abs(), points[..., 2] + self.radius
         on_flank = y * half.sin() - z * half.cos() > 0
         return torch.where(on_flank, y * half.cos() + z * half.sin(), norm(torch.stack([y, z], -1))) - self.radius
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class Box(Indenter):
     """A box centred at the origin, with rounded edges and corners.
@@ -285,6 +293,7 @@ class Box(Indenter):
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class Union(Indenter):
     """Several bodies joined to one rigid body.

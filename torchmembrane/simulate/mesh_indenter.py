@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..errors import MembraneError, check_arguments, expect
 from ..files.safe_read import DAMAGE, in_one_line, read_bytes
+from ..torch_modes import on_cpu
 from .indenters import Indenter, box_distance
 
 KINDS = ("stl", "obj", "ply")
@@ -20,6 +21,7 @@ MOST_TRIANGLES, MOST_BYTES = 200_000, 2**25
 
 
 @check_arguments
+@on_cpu
 @dataclass(frozen=True, eq=False)
 class MeshIndenter(Indenter):
     """A body bounded by a closed triangle mesh.

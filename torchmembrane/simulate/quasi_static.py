@@ -167,7 +167,7 @@ def carried(x: Tensor, membrane: Membrane, positions: Tensor | np.ndarray) -> Te
         >>> carried(dome.rest + torch.tensor([0.0, 0.0, 1.0]), dome, dome.rest[40:41]).tolist()
         [[0.0, 0.0, 13.0]]
     """
-    positions = torch.as_tensor(np.asarray(positions), dtype=x.dtype)
+    positions = torch.as_tensor(np.asarray(positions), dtype=x.dtype, device=x.device)
     points: SurfacePoints = membrane.closest_points(positions)
     displacement = (x - membrane.rest)[..., torch.from_numpy(points.vertices), :]
     return positions + (torch.from_numpy(points.weights).to(x)[..., None] * displacement).sum(-2)

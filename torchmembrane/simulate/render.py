@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from ..errors import MembraneError, check_arguments
 from ..sensor.sensor import Sensor
 from ..surface.tangent import tangent_frame
+from ..torch_modes import on_cpu
 from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, diffuse_light, specular_light, vignette
 from .discs import draw_discs
 from .pattern import Canvas, Dots, Painted, Speckle, dot_coordinates, inside_unit_disc, pattern_of
@@ -41,6 +42,7 @@ class RenderedDots(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 class Renderer(nn.Module):
     """Renders images of one sensor.
 
@@ -184,7 +186,7 @@ class Renderer(nn.Module):
         images = torch.stack([self._sharp(*pair) for pair in _each(x, light)])
         images = images.view(*vertices.shape[:-2], *images.shape[-2:])
         width, height = self.camera.image_size
-        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        v, u = torch.meshgrid(*(torch.arange(size, device=images.device) for size in (height, width)), indexing="ij")
         images = images * vignette(torch.stack([u, v], -1).to(images), self.camera, self.appearance.vignetting)
         return blurred(images, self.appearance.blur).clamp(0, 1)
 

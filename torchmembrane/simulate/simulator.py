@@ -16,6 +16,7 @@ from ..files.images import to_grey
 from ..sensor.camera_tables import shared_image
 from ..sensor.factories import cavity_filling, elastic_energy
 from ..sensor.sensor import Sensor
+from ..torch_modes import on_cpu
 from .appearance import DEFAULT_APPEARANCE, Appearance, noisy
 from .indenters import Indenter
 from .pattern import pattern_of
@@ -96,6 +97,7 @@ class SimulatedFrame(NamedTuple):
 
 
 @check_arguments
+@on_cpu
 class Simulator:
     """Simulates presses and images of one sensor.
 

@@ -126,4 +126,4 @@ def _one_thread() -> Iterator[None]:
 @cache
 def _lapack(name: str, dtype: torch.dtype) -> Any:
     """Return LAPACK's function of this name for a precision."""
-    return get_lapack_funcs(name, dtype=torch.empty(0, dtype=dtype).numpy().dtype)
+    return get_lapack_funcs(name, dtype=torch.empty(0, dtype=dtype, device="cpu").numpy().dtype)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from ..errors import MembraneError, check_arguments
 from ..pose import ViewPose
 from ..solve.stencil import apply_stencil, stencil_kernels
+from ..torch_modes import on_cpu
 from . import projection
 from .checks import checked_grid, checked_orientation
 from .projection import SurfacePoints
@@ -20,6 +21,7 @@ from .resampling import resampled_grid
 from .topology import corners, corners_to_vertices, rim_loop, triangles_of, triangles_to_corners
 
 
+@on_cpu
 class Membrane(nn.Module):
     """A rest surface with a fixed rim, given as an `m x n` grid of vertices in the camera's frame.
 
@@ -75,8 +77,7 @@ class Membrane(nn.Module):
         X, fixed = checked_grid(vertices, fixed)
         m, n = X.shape[:2]
         self.grid = (m, n)
-        index = torch.arange(m * n).reshape(m * n, 1)
-        triangles = triangles_of(corners(index, self.grid)).reshape(-1, 3)
+        triangles = triangles_of(corners(torch.arange(m * n)[:, None], self.grid)).reshape(-1, 3)
         rest = torch.from_numpy(X.reshape(-1, 3).copy())
         self.outward = checked_orientation(rest.numpy(), triangles.numpy(), fixed.ravel())
         if self.outward < 0:
@@ -84,8 +85,7 @@ class Membrane(nn.Module):
         self.register_buffer("rest", rest)
         chords = self._chord_kernels()
         self.register_buffer("chord_kernels", chords)
-        ones = torch.ones(m * n, 1).double()
-        self.register_buffer("chords_beyond_border", apply_stencil(ones, chords, self.grid).flatten())
+        self.register_buffer("chords_beyond_border", apply_stencil(torch.ones(m * n, 1).double(), chords, self.grid).flatten())
         self.register_buffer("xyz_to_yzxzxy", torch.tensor([1, 2, 0, 2, 0, 1]))
         self.register_buffer("volume_third_derivatives", self.outward / 6 * _determinant_derivatives())
         self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())

@@ -99,7 +99,7 @@ def grid_triangles(grid: tuple[int, int]) -> np.ndarray:
         >>> grid_triangles((2, 2)).tolist()
         [[0, 2, 3], [0, 3, 1]]
     """
-    index = torch.arange(grid[0] * grid[1])[:, None]
+    index = torch.arange(grid[0] * grid[1], device="cpu")[:, None]
     triangles: np.ndarray = triangles_of(corners(index, grid)).reshape(-1, 3).numpy()
     return triangles
 

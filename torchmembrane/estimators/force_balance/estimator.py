@@ -33,6 +33,7 @@ from ...solve.stencil import pad_border
 from ...surface.bicubic import Refinement
 from ...surface.membrane import Membrane
 from ...surface.projection import SurfacePoints
+from ...torch_modes import on_cpu
 from ..base import Deviations, Equilibrium, Estimator, Observation, Problem, StandardDeviations
 from ..contacts import Contacts
 from .contact_force import ContactForce
@@ -58,6 +59,7 @@ MIN_RESOLVED_LINES = 17
 """Lines of a grid with a discretisation error below the markers' noise; on coarser ones it grows as the square of the step."""
 
 
+@on_cpu
 class ForceBalance(Estimator):
     """Estimates surface, contact tractions and pressure from marker rays.
 

@@ -33,7 +33,7 @@ def gauge_reading(pressure: Tensor | float, rest_pressure: Tensor, deviation: fl
     Raises:
         MembraneError: the pressure has another shape, or is infinite.
     """
-    read, frames = torch.as_tensor(pressure).to(confidence), len(confidence)
+    read, frames = torch.as_tensor(pressure, device=confidence.device).to(confidence), len(confidence)
     if read.shape not in ((), (frames,)):
         raise MembraneError(f"pressure {list(read.shape)}; expected [{frames}], one reading per frame, NaN if there is none")
     if can_sync(read) and bool(read.isinf().any()):

@@ -20,6 +20,7 @@ from ...solve.anderson import accelerated, first
 from ...solve.kkt import constrained_minimum
 from ...surface.membrane import Membrane
 from ...surface.topology import corners, corners_to_vertices
+from ...torch_modes import on_cpu
 from ..base import Equilibrium, Observation
 from .flow import VertexFlow
 from .vertex_rays import VertexRays
@@ -51,6 +52,7 @@ class MinimumEnergySettings:
             raise MembraneError(f"MinimumEnergySettings: steps = {self.steps}; expected at least 1")
 
 
+@on_cpu
 class MinimumEnergy(VertexRays):
     """Finds the surface with the least energy on given rays that satisfies the cavity's law (eqs. 18, 22).
 

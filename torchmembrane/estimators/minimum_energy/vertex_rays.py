@@ -10,6 +10,7 @@ from ...mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
 from ...surface.membrane import Membrane
+from ...torch_modes import on_cpu
 from ..base import Equilibrium, Estimator, Observation, Problem
 from ..contacts import Contacts
 from .flow import FlowInterpolation, VertexFlow
@@ -54,6 +55,7 @@ class VertexRays(Estimator):
         self.register_buffer("free", (~membrane.fixed).double())
 
     @classmethod
+    @on_cpu
     def from_problem(cls, problem: Problem, settings: Any = None) -> Self:
         """Build the estimator for a sensor; `settings` are those of the class."""
         settings = settings or cls.Settings()

@@ -28,6 +28,7 @@ from ...solve.kkt import constrained_minimum
 from ...solve.stencil import inner, pad_border
 from ...surface.membrane import Membrane
 from ...surface.topology import corners, corners_to_vertices
+from ...torch_modes import on_cpu
 from ..base import Equilibrium, Observation, Problem
 from ..minimum_energy.flow import FlowInterpolation, VertexFlow
 from ..minimum_energy.segmentation import ContactRegions
@@ -108,6 +109,7 @@ class PaperSettings:
             raise MembraneError(f"PaperSettings: rounds = {self.rounds}; expected at least 1")
 
 
+@on_cpu
 class PaperEstimator(VertexRays):
     """Finds the surface with the least harmonic energy at the linearised volume, and its contacts (eqs. 14-29, section 5.1).
 

@@ -7,6 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from ...files.levels import telling_bits
+from ...torch_modes import on_cpu
 from ..spacing import neighbours, partly_in_view
 from .blobs import check_count, find_blobs
 from .ellipse import TOLERANCE, log_radii, rms_half_axes, size_tolerance
@@ -69,6 +70,7 @@ def size_classes(pixels: np.ndarray, shapes: np.ndarray) -> np.ndarray:
 
 
 @telling_bits
+@on_cpu
 def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) -> DotPattern:
     """Find all dots of the pattern in the rest image, in any arrangement and of one or two sizes.
 
@@ -110,6 +112,7 @@ def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) 
 
 
 @telling_bits
+@on_cpu
 def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, sizes: np.ndarray, polarity: str) -> DotPattern:
     """Measure the listed dots in the rest image.
 

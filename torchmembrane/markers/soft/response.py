@@ -1,5 +1,6 @@
 """Similarity of an image to dots, each at its own scale: differences of Gaussians on a pyramid."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
 from ...control_flow import traced
+from ...torch_modes import on_cpu
 from ..texture.pyramid import low_pass
 
 LEVELS = 5  # of the pyramid, by halves
@@ -149,6 +151,7 @@ def _with_neighbours(rungs: list[int]) -> list[int]:
     return sorted({rung + side for rung in rungs for side in (1, -1)})
 
 
+@on_cpu  # of kornia's sigma, which it checks on the host
 def _blurred(image: Tensor, sigma: float) -> Tensor:
-    half = min(max(1, int(np.ceil(3 * sigma))), min(image.shape[-2:]) - 1)
+    half = min(max(1, math.ceil(3 * sigma)), min(image.shape[-2:]) - 1)
     return gaussian_blur2d(image, 2 * half + 1, (sigma, sigma), "replicate")
