@@ -152,6 +152,39 @@ def test_autocast_changes_nothing(sensor, photographs, estimator):
             torch.testing.assert_close(one._asdict()[field], value, equal_nan=True)
 
 
+def test_autocast_changes_neither_what_is_built_nor_what_else_is_told(sensor, photographs):
+    """Constants, a changed prestretch, the markers at rest, and standard deviations."""
+
+    def told():
+        made, other = tm.Reconstructor(sensor), tm.Reconstructor(sensor, locator="soft")
+        result, rest = made(photographs[:1]), made.observer.rest_of(made.grey(photographs[:1]))
+        deviations = made.standard_deviations(result)
+        made.estimator.set_prestretch(torch.tensor(1.2))
+        rendered = tm.simulate.Renderer(sensor, samples=1)
+        images = rendered(sensor.membrane.rest), rendered.depth(sensor.membrane.rest)
+        return [*made.buffers(), *other.buffers(), *rest, *made.observer.locate(made.grey(photographs)), *deviations, *images]
+
+    with torch.no_grad():
+        expected = told()
+        with torch.autocast("cpu", torch.bfloat16):
+            found = told()
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == other.dtype and torch.equal(one.nan_to_num(), other.nan_to_num())
+
+
+@pytest.mark.parametrize("locator", ["fit", "soft"])
+def test_a_gradient_that_is_taken_within_autocast_is_one_of_few_digits(sensor, photographs, locator):
+    """torch's own operations compute it in half precision then; the adjoint system is solved in the module's."""
+    made, slopes = tm.Reconstructor(sensor, locator=locator), []
+    for enabled in (False, True):
+        image = made.grey(photographs[:1]).requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            made(image).displacement.square().sum().backward()
+        slopes.append(image.grad)
+    assert slopes[0].abs().max() > 0
+    assert (slopes[1] - slopes[0]).norm() < 0.03 * slopes[0].norm()
+
+
 @pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])
 def test_an_empty_batch_gives_an_empty_result(sensor, estimator):
     made = tm.Reconstructor(sensor, estimator)

@@ -223,8 +223,7 @@ class Reconstructor(FullPrecision):
             MembraneError: the shape is wrong, or a confidence lies outside 0..1.
         """
         with full_precision(self.rest_pixels):
-            flow = self.observer.from_pixels(pixels, confidence, rest_pixels, noise)
-            return in_inference_mode(self._solve, flow, pressure)
+            return in_inference_mode(self._solve, self.observer.from_pixels(pixels, confidence, rest_pixels, noise), pressure)
 
     def _seen(self, grey: Tensor, before: Tensor | None, rest: Tensor | None, *gauge: Any) -> Reconstruction:
         return self._solve(self.observer(grey, before, rest), *gauge)
@@ -341,10 +340,11 @@ class Reconstructor(FullPrecision):
         observer, confidence = self.observer, self.observer.sighted(result.confidence)
         pixels = observer.sighted(torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels))
         seen = self.camera, observer.with_rays(pixels, confidence), observer.seen_by_each(result.markers)
-        noise = turns_by_noise(*seen, 2 * observer.rest_covariance)
-        observation = self._gauged(self.observation(pixels - observer.rest_pixels, confidence), pressure)
         vertices = torch.where(result.vertices.isfinite(), result.vertices, self.estimator.membrane.rest)
-        pressure = torch.where(result.pressure.isfinite(), result.pressure, self.estimator.rest_pressure)
-        moved = self.camera.motion_in_pixels(result.camera_motion).nan_to_num()
-        found = self.estimator.standard_deviations(vertices, pressure, moved, observation, noise)
+        reported = torch.where(result.pressure.isfinite(), result.pressure, self.estimator.rest_pressure)
+        with full_precision(self.rest_pixels):
+            noise = turns_by_noise(*seen, 2 * observer.rest_covariance)
+            observation = self._gauged(self.observation(pixels - observer.rest_pixels, confidence), pressure)
+            moved = self.camera.motion_in_pixels(result.camera_motion).nan_to_num()
+            found = self.estimator.standard_deviations(vertices, reported, moved, observation, noise)
         return found.known(result.vertices.flatten(1).isfinite().all(1))

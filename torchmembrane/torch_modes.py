@@ -1,7 +1,7 @@
-"""Modes of torch that change no result, although a caller has set them: a default device."""
+"""Modes of torch that change no result, although a caller has set them: a default device, and autocast."""
 
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ Built = TypeVar("Built", bound=Callable[..., Any])
 
 
 def on_cpu(target: Built) -> Built:
-    """Decorate a function or class so that it creates its tensors on the CPU.
+    """Decorate a function or class so that it creates its tensors on the CPU, and without autocast.
 
     The decorator is for what builds or calibrates. Code that is given tensors creates others on the device of these instead.
     `torch.compile` cannot trace a change of the default device; in a compiled graph the function is called as it is.
@@ -36,7 +36,20 @@ def on_cpu(target: Built) -> Built:
 
     @wraps(target)
     def called(*arguments: Any, **options: Any) -> Any:
-        with nullcontext() if torch.compiler.is_compiling() else torch.device("cpu"):
+        if torch.compiler.is_compiling():
+            return target(*arguments, **options)
+        with torch.device("cpu"), without_autocast("cpu"):
             return target(*arguments, **options)
 
     return called  # type: ignore[return-value]
+
+
+def without_autocast(device: str) -> AbstractContextManager[object]:
+    """Return a context that disables autocast on a type of device, if it has autocast.
+
+    Example:
+        >>> with torch.autocast("cpu"), without_autocast("cpu"):
+        ...     (torch.eye(2) @ torch.eye(2)).dtype
+        torch.float32
+    """
+    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()

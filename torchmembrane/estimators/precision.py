@@ -1,13 +1,14 @@
 """Floating-point precision of the solvers."""
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
+from ..torch_modes import without_autocast
 
 PRECISIONS = (torch.float32, torch.float64)
 
@@ -25,8 +26,7 @@ class FullPrecision(nn.Module):
 def full_precision(like: Tensor) -> AbstractContextManager[object]:
     """Return a context without autocast on the device of a tensor, whose precision is checked."""
     check_precision(like.dtype)
-    device = like.device.type
-    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
+    return without_autocast(like.device.type)
 
 
 def check_precision(dtype: torch.dtype) -> None:

@@ -12,6 +12,7 @@ from ..files.levels import too_few_bits
 from ..files.tensors import tensor_of
 from ..machine_code import is_used, using
 from ..results.status import Status
+from ..torch_modes import without_autocast
 from .locator import Locator, isotropic
 from .native_frames import found_by, is_native
 from .native_image import statuses
@@ -164,7 +165,7 @@ class MarkerObserver(nn.Module):
         Raises:
             MembraneError: an image does not show the markers.
         """
-        with torch.no_grad():
+        with torch.no_grad(), without_autocast(images.device.type):
             displacement, confidence, covariance, status = self.judge(*self(images))
         if (status != Status.OK.value).any():
             bad = int(status.ne(Status.OK.value).nonzero()[0])
@@ -180,7 +181,7 @@ class MarkerObserver(nn.Module):
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which are found,
         `[B, D]`."""
-        with torch.no_grad():
+        with torch.no_grad(), without_autocast(images.device.type):
             pixels, confidence, _ = self.locator(images)
         return pixels, confidence > FOUND_CONFIDENCE
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from ..errors import MembraneError, check_arguments
 from ..sensor.sensor import Sensor
 from ..surface.tangent import tangent_frame
-from ..torch_modes import on_cpu
+from ..torch_modes import on_cpu, without_autocast
 from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, diffuse_light, specular_light, vignette
 from .discs import draw_discs
 from .pattern import Canvas, Dots, Painted, Speckle, dot_coordinates, inside_unit_disc, pattern_of
@@ -181,6 +181,10 @@ class Renderer(nn.Module):
         Returns:
             Images, `[..., H, W]`, float32 in 0..1.
         """
+        with without_autocast(vertices.device.type):
+            return self._rendered(vertices)
+
+    def _rendered(self, vertices: Tensor) -> Tensor:
         x = self.fine_vertices(vertices)
         light = self._light(x)
         images = torch.stack([self._sharp(*pair) for pair in _each(x, light)])
@@ -199,7 +203,8 @@ class Renderer(nn.Module):
         Returns:
             Depths, length unit, `[..., H, W]`; NaN outside the membrane.
         """
-        images = [self._depth(x) for (x,) in _each(self.fine_vertices(vertices))]
+        with without_autocast(vertices.device.type):
+            images = [self._depth(x) for (x,) in _each(self.fine_vertices(vertices))]
         return torch.stack(images).view(*vertices.shape[:-2], *images[0].shape)
 
     def _depth(self, x: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..torch_modes import without_autocast
 from .anderson import accelerated, first
 
 Linear = Callable[[Tensor], Tensor]
@@ -144,7 +145,7 @@ class _Solution(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (residual,) = ctx.saved_tensors
-        with torch.no_grad():
+        with torch.no_grad(), without_autocast(gradient.device.type):
             solved = ctx.solve(gradient)
         return _Once.apply(solved, gradient, residual), None, None
 

@@ -33,7 +33,7 @@ from ...solve.stencil import pad_border
 from ...surface.bicubic import Refinement
 from ...surface.membrane import Membrane
 from ...surface.projection import SurfacePoints
-from ...torch_modes import on_cpu
+from ...torch_modes import on_cpu, without_autocast
 from ..base import Deviations, Equilibrium, Estimator, Observation, Problem, StandardDeviations
 from ..contacts import Contacts
 from .contact_force import ContactForce
@@ -171,7 +171,8 @@ class ForceBalance(Estimator):
     def set_prestretch(self, prestretch: Tensor) -> None:
         """Change the prestretch `[]`, which may require gradients, with rest pressure and rest load but not `reference`."""
         self.elasticity.prestretch = prestretch
-        self.cavity.rest_pressure, self.equations.forces.rest_load = rest_balance(self.membrane, self.elasticity)
+        with without_autocast(prestretch.device.type):
+            self.cavity.rest_pressure, self.equations.forces.rest_load = rest_balance(self.membrane, self.elasticity)
         if self.coarse is not None:
             self.coarse.set_prestretch(prestretch)
 
