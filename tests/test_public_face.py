@@ -193,6 +193,14 @@ def test_an_empty_batch_gives_an_empty_result(sensor, estimator):
         assert all(shape[0] == 0 for shape in shapes) and shapes[0] == (0, 81, 3) and got.status.dtype == torch.int32
 
 
+@pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])
+def test_an_empty_batch_gives_empty_gradients(sensor, estimator):
+    made = tm.Reconstructor(sensor, estimator)
+    images, pixels = (torch.zeros(0, *shape, requires_grad=True) for shape in ((1, 480, 640), (121, 2)))
+    (made(images).force.sum() + made.from_pixels(pixels).force.sum()).backward()
+    assert images.grad.shape == images.shape and pixels.grad.shape == pixels.shape
+
+
 def test_confidence_outside_its_range_is_refused(reconstructor):
     pixels = reconstructor.rest_pixels
     for wrong in (1.5, -0.1, torch.nan):

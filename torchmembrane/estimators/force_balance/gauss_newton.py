@@ -90,7 +90,7 @@ class GaussNewton(nn.Module):
         """Return a state in which all frames have settled, with the gradients of the fixed point of the steps."""
         if not torch.is_grad_enabled() or self.is_native(*state, *measured):
             return state
-        sizes = [state.u[0].numel(), 1, state.moved.shape[1]]
+        sizes = [state.u.shape[1:].numel(), 1, state.moved.shape[1]]
         tau, whole = (torch.full_like(state.pressure, value) for value in (self.settings.tau[1], 1.0))
 
         def stepped(unknowns: Tensor) -> Tensor:
