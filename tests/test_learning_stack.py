@@ -59,6 +59,16 @@ def test_a_state_that_holds_every_constant_still_loads(sensor, reconstructor, im
         assert_same(fresh(images), other(images))
 
 
+@pytest.mark.parametrize("assign", [False, True])
+def test_a_state_of_another_precision_takes_that_of_the_module(sensor, reconstructor, images, assign):
+    """Assigned, too, where torch would keep the state's precision beside that of the constants that the state lacks."""
+    fresh = tm.Reconstructor(sensor)
+    fresh.load_state_dict(tm.Reconstructor(sensor, dtype=torch.float64).state_dict(), assign=assign)
+    assert {buffer.dtype for buffer in fresh.camera.buffers()} == {torch.float32}
+    with torch.no_grad():
+        assert_same(fresh(images), reconstructor(images))
+
+
 def test_the_state_of_another_grid_or_sensor_is_refused_in_words(sensor, reconstructor):
     finer = replace(sensor, membrane=sensor.surface.membrane((11, 11)))
     with pytest.raises(tm.MembraneError, match="another sensor or grid; build the Reconstructor"):

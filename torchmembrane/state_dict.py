@@ -49,7 +49,7 @@ def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) ->
 
 
 def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Check a state and add the missing constants with their present values."""
+    """Check a state, convert it to the module's precision and device, and add the missing constants as they are."""
     kept, others = _kept(module), []
     first = {id(buffer): name for name, buffer in reversed(list(module.named_buffers()))}
     for name, buffer in module.named_buffers(remove_duplicate=False):
@@ -59,13 +59,11 @@ def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
                 f"Reconstructor.load_state_dict: {name} {list(given.shape)}; expected {list(buffer.shape)}: it is the state of "
                 "another sensor or grid; build the Reconstructor from that sensor's file"
             )
+        if given is not None:
+            given = state[prefix + name] = given.to(buffer)
         if name == IDENTITY and given is not None:
             _check_identity(given, buffer)
-        elif (
-            given is not None
-            and name in kept
-            and not torch.allclose(given.to(buffer), buffer, rtol=SAME_MARKERS, atol=SAME_MARKERS**2)
-        ):
+        elif given is not None and name in kept and not torch.allclose(given, buffer, rtol=SAME_MARKERS, atol=SAME_MARKERS**2):
             others.append(name)
         if first[id(buffer)] not in kept:
             state[prefix + name] = buffer
@@ -89,7 +87,7 @@ def _check_others(names: list[str]) -> None:
 
 
 def _check_identity(given: Tensor, own: Tensor) -> None:
-    off = torch.linalg.vector_norm(given.to(own) - own, dim=-1).max()
+    off = torch.linalg.vector_norm(given - own, dim=-1).max()
     if off > SAME_MARKERS * torch.linalg.vector_norm(own.amax(0) - own.amin(0)):
         raise MembraneError(
             f"Reconstructor.load_state_dict: {IDENTITY} up to {float(off):.3g} off this sensor's; expected the state of this "
