@@ -4,6 +4,7 @@ What a view lacks at a moment is reported.
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -209,6 +210,28 @@ def test_topics_of_the_views_are_matched_by_their_stamps(recorded, tmp_path, cap
     ):
         assert command(path, bag, *given, out=tmp_path / "no") == 2
         assert wanted in capsys.readouterr().err
+
+
+def test_a_camera_info_of_the_image_that_regions_share_is_compared_with_it(tmp_path, capsys):
+    """The first view is a region of the image of a camera whose CameraInfo is of the whole image."""
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag2 import StoragePlugin
+    from test_rosbag import camera_info, raw, write_bag
+
+    whole = tm.Camera("pinhole", (320, 120), (100, 100), (79.5, 59.5), [0.01, 0.0])
+    other = tm.Camera("pinhole", (320, 120), (100, 100), (239.5, 59.5)).in_mode((160, 0, 160, 120))
+    first = whole.in_mode((0, 0, 160, 120))
+    views = View("left", first, is_region=True), View("right", other, BESIDE, is_region=True)
+    sensor = replace(cap(camera=first), views=views)
+    (camera,) = sensor.image_cameras
+    assert camera.image_size == whole.image_size
+    torch.testing.assert_close(camera.state_dict(), whole.state_dict())
+    path, image = sensor.to_file(tmp_path / "sensor.toml"), raw(0, np.zeros((120, 320), np.uint8), "mono8")
+    for name, centre, is_said in (("same", (79.5, 59.5), False), ("moved", (89.5, 59.5), True)):
+        info = camera_info(whole, centre=centre)
+        write_bag(tmp_path / name, StoragePlugin.MCAP, [("/finger/camera_info", info), ("/finger/image_raw", image)])
+        assert command(path, tmp_path / name, out=tmp_path / f"out_{name}") == 1  # the image is blank
+        assert ("CameraInfo" in capsys.readouterr().err) == is_said
 
 
 def frames_of(images, seconds):

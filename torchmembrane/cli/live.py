@@ -225,8 +225,8 @@ def _watchers(
         said.append(lambda: f"{done}; {_left_out(later)}")
 
     if arguments.record is not None:
-        cameras = [view.camera for view in sensor.views] if sensor.views_apart else [sensor.camera]
-        recording = stack.enter_context(Recording(arguments.record, stream.mesh, *(camera.bits for camera in cameras)))
+        bits = [camera.bits for camera in sensor.image_cameras]
+        recording = stack.enter_context(Recording(arguments.record, stream.mesh, *bits))
         add(recording.keep, f"recorded in {arguments.record}")
     if wants_rerun(arguments):
         log = stack.enter_context(RerunLog(stream.mesh, arguments.save))

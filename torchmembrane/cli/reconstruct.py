@@ -153,7 +153,7 @@ def run(arguments: Namespace) -> int:
     format = arguments.format or ("parquet" if by_ray else "npz")
     settings = _settings(reconstructor, arguments, format, inputs)
     check_folder(arguments.out, sensor.fingerprint, settings)
-    for remark in bag_remarks(inputs, [view.camera for view in sensor.views] if sensor.views_apart else [sensor.camera]):
+    for remark in bag_remarks(inputs, sensor.image_cameras):
         print(f"torchmembrane: {remark}", file=sys.stderr)
     mesh, shard = Mesh.from_reconstructor(reconstructor, settings), Shard(*arguments.shard)
     bag = result_bag(arguments.bag, inputs, mesh, reconstructor, shard) if arguments.bag else None

@@ -179,6 +179,13 @@ class Sensor:
         """Names of the views that have images of their own; empty for one view, or if views are regions of one image."""
         return [view.name for view in self.views if view.region is None]
 
+    @property
+    def image_cameras(self) -> list[Camera]:
+        """Cameras of the images that arrive together: one for each view, or one alone if the views are regions of its image."""
+        if self.views_apart:
+            return [view.camera for view in self.views]
+        return [self.views[0].image_camera if self.views else self.camera]
+
     def _solve_again(self, surface: InflatedSurface) -> None:
         """Solve the rest surface again with the sensor's material if the given one was solved with another material."""
         own = surface.made_of(self.material, self.length_unit)

@@ -66,6 +66,14 @@ class View:
         """Left, top, width and height of the region in the shared image, px; None: the view has images of its own."""
         return tuple(self.camera.mode.crop) if self.is_region and self.camera.mode is not None else None  # type: ignore[return-value]
 
+    @property
+    def image_camera(self) -> Camera:
+        """Camera of the images that show the view: of the whole shared image if the view is a region of it."""
+        mode = self.camera.mode
+        if self.region is None or mode is None:
+            return self.camera
+        return _with_lens(self.camera, mode.image_size, mode.focal, mode.centre)
+
     def with_camera(self, camera: Camera) -> "View":
         """Return the view with another camera (lens and ports), for the pixels of the view's own images or region.
 
@@ -80,9 +88,7 @@ class View:
             return replace(self, camera=camera)
         left, top, _, _ = self.region
         u, v = camera.centre.tolist()
-        lens = camera.focal.tolist(), (u + left, v + top), camera.distortion.tolist()
-        beyond: dict[str, Any] = dict(ports=camera.ports, medium_index=camera.medium_index.item(), bits=camera.bits)
-        whole = Camera(camera.model, self.camera.mode.image_size, *lens, **beyond)
+        whole = _with_lens(camera, self.camera.mode.image_size, camera.focal.tolist(), (u + left, v + top))
         return replace(self, camera=whole.in_mode(self.region))
 
     def membrane(self, membrane: Membrane) -> Membrane:
@@ -101,6 +107,12 @@ class View:
             "region": None if self.region is None else list(self.region),
             "side": None if self.side == SIDES[0] else self.side,
         }
+
+
+def _with_lens(camera: Camera, image_size: Sequence[int], focal: Sequence[float], centre: Sequence[float]) -> Camera:
+    """Return a camera with another image size, focal length and centre, and with the distortion, ports and bits of `camera`."""
+    beyond: dict[str, Any] = dict(ports=camera.ports, medium_index=camera.medium_index.item(), bits=camera.bits)
+    return Camera(camera.model, image_size, focal, centre, camera.distortion.tolist(), **beyond)
 
 
 class SurfaceInView(Surface):
