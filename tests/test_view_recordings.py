@@ -181,6 +181,7 @@ def test_an_image_that_a_view_lacks_is_said_and_taken_when_it_is_there(recorded,
 def test_topics_of_the_views_are_matched_by_their_stamps(recorded, tmp_path, capsys):
     """A bag of both views' images, in whatever order they were received; of the third moment the left image is missing."""
     pytest.importorskip("rosbags")
+    from rosbags.highlevel import AnyReader
     from rosbags.rosbag2 import StoragePlugin
     from test_rosbag import STORE, raw, write_bag
 
@@ -191,7 +192,7 @@ def test_topics_of_the_views_are_matched_by_their_stamps(recorded, tmp_path, cap
         stamp = message.header.stamp
         at = int(round(1e9 * (stamp.sec + 0.2 * n + 0.03 * w)))
         stamp = STORE.types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
-        header = STORE.types["std_msgs/msg/Header"](stamp=stamp, frame_id="finger")
+        header = STORE.types["std_msgs/msg/Header"](stamp=stamp, frame_id=f"{VIEWS[w]}_optical")
         fields = {key: getattr(message, key) for key in ("height", "width", "encoding", "is_bigendian", "step", "data")}
         late.append((f"/{VIEWS[w]}/image", STORE.types[kind](header=header, **fields)))
     bag = tmp_path / "run"
@@ -204,6 +205,9 @@ def test_topics_of_the_views_are_matched_by_their_stamps(recorded, tmp_path, cap
     for n in (0, 1, 3):
         assert np.abs(results[f"run_00000{n}"]["vertices"] - expected[n]).max() < 5e-3
     assert "4 frames with a wrench" in said.out
+    with AnyReader([tmp_path / "forces"]) as reader:  # results are in the first view's frame, also where it has no picture
+        sent = [reader.deserialize(content, each.msgtype).header.frame_id for each, _, content in reader.messages()]
+    assert len(sent) >= 4 * 5 and set(sent) == {"left_optical"}
     for given, wanted in (
         ([], "expected the topic of each, --topic left=TOPIC --topic right=TOPIC"),
         (topics[:2], "a sensor of several views"),

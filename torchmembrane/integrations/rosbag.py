@@ -126,9 +126,9 @@ def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
 
 
 class BagWriter:
-    """A bag of results: `with BagWriter("out", units, mcap=True) as bag`, then `bag.add(image, frame)`.
+    """A bag of results: `with BagWriter("out", units, mcap=True) as bag`, then `bag.add(image, frame, frame_id)`.
 
-    Every frame adds its messages on `TOPICS` in `NAMESPACE`, with the header and the time of reception of its image.
+    Every frame adds its messages on `TOPICS` in `NAMESPACE`, with the time stamp and the time of reception of its image.
 
     Args:
         path: path of the folder: new, or that of an earlier bag of results, which is replaced when the new one is complete.
@@ -171,17 +171,18 @@ class BagWriter:
                     self.path.rename(self._folder / ".before")
                 self._writer.path.rename(self.path)
 
-    def add(self, image: StampedMessage, frame: Frame) -> None:
+    def add(self, image: StampedMessage, frame: Frame, frame_id: str) -> None:
         """Write a frame's messages; `written` counts the frames that have a wrench.
 
         Args:
             image: message of the image from which the frame was reconstructed.
             frame: result of the frame.
+            frame_id: coordinate frame of the results, that of the first view's camera.
         """
-        given = image.message.header
+        given = image.message.header.stamp
         with _writing_bag(self.path):
-            stamp = self._new("builtin_interfaces/msg/Time", sec=given.stamp.sec, nanosec=given.stamp.nanosec)
-            header = self._new("std_msgs/msg/Header", stamp=stamp, frame_id=given.frame_id)
+            stamp = self._new("builtin_interfaces/msg/Time", sec=given.sec, nanosec=given.nanosec)
+            header = self._new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
             for topic, message in self.units.messages(frame).items():
                 self._write(topic, image.received, message._replace(fields={"header": header, **message.fields}))
         self.written += has_wrench(frame)

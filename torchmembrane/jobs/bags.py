@@ -54,16 +54,22 @@ def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstru
 
 
 def write_bag(writer: BagWriter, inputs: Inputs, results: Path) -> int:
-    """Write messages for all bag frames that have results in a folder; return the number of frames with a wrench."""
+    """Write messages for all bag frames that have results in a folder; return the number of frames with a wrench.
+
+    All results are in the frame of the first view's camera, also those of moments at which this view has no picture.
+    """
     found = read_results(results)
     names = set(found.names)
     with writer:
         for path in inputs.bags:
             topics = [image_topic(path, topic)[0] for topic in inputs.image_topics]
+            of_first = next(messages(path, topics[0]), None)
             for number, moment in enumerate(moments([_timed(messages(path, topic)) for topic in topics])):
+                of_first = of_first if moment[0] is None else moment[0].picture
                 name = picture_name(path, number)
                 if name in names:
-                    writer.add(next(each.picture for each in moment if each is not None), found[name])
+                    frame_id = "" if of_first is None else of_first.message.header.frame_id
+                    writer.add(next(each.picture for each in moment if each is not None), found[name], frame_id)
     return writer.written
 
 
