@@ -36,6 +36,7 @@ from torchmembrane.files.images import to_grey
 from torchmembrane.integrations.frame_messages import TOPICS
 from torchmembrane.sensor.parts import Cavity
 from torchmembrane.sensor.record import Record
+from torchmembrane.sensor.views import View
 
 ROOT, PACKAGE = Path(__file__).parents[3], Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -243,6 +244,39 @@ def test_it_lives_the_lives_of_a_lifecycle_node(system, levels):
 def test_what_is_wrong_is_said_and_the_node_stays_unconfigured(system_of, sensor, options, said, capfd):
     system = system_of(**{"sensor": sensor, **options})
     assert system.node.trigger_configure() == FAILURE and said in capfd.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def mirrored(tmp_path_factory):
+    """A file of the example's sensor with two views, both the same region of one image, or each with images of its own."""
+
+    def path_of(is_region):
+        one = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+        width, height = one.image_size
+        lens = one.camera.focal.tolist(), one.camera.centre.tolist(), one.camera.distortion.tolist()
+        whole = tm.Camera(one.camera.model, (width + 100, height), *lens)
+        camera = whole.in_mode((0, 0, width, height)) if is_region else one.camera
+        views = tuple(View(name, camera, rest_image=one.markers.rest_image, is_region=is_region) for name in ("a", "b"))
+        markers = replace(one.markers, rest_image=None)
+        two = replace(one, membrane=one.surface.membrane((9, 9)), camera=camera, markers=markers, views=views)
+        return two.to_file(tmp_path_factory.mktemp("views") / "sensor.toml")
+
+    return path_of
+
+
+def test_views_that_share_an_image_are_followed_in_it(system_of, mirrored, levels):
+    system = system_of(mirrored(is_region=True)).start()
+    system.publisher().publish(image(np.pad(levels, ((0, 0), (0, 100)))))
+    system.until(lambda: system.followed())
+    assert system.node.health.refused == 0 and len(system.got["status"]) == 1
+    info = CameraInfo(width=740, height=480)
+    system.publisher(CameraInfo, "camera_info").publish(info)
+    system.until(lambda: system.node.compared)
+
+
+def test_views_with_images_of_their_own_are_refused_at_once(system_of, mirrored, capfd):
+    assert system_of(mirrored(is_region=False)).node.trigger_configure() == FAILURE
+    assert "views a, b have images of their own" in capfd.readouterr().err
 
 
 def test_relative_forces_are_no_newtons(system_of, sensor, tmp_path, capfd):

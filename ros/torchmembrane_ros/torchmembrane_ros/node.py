@@ -159,7 +159,13 @@ class TrackerNode(LifecycleNode):
         parameters.refuse_wrong(self)
         path = Path(self.get_parameter("sensor").value)
         reconstructor = tm.Reconstructor.from_file(path)
-        sensor, self.camera = reconstructor.sensor, reconstructor.sensor.camera
+        sensor = reconstructor.sensor
+        if sensor.views_apart:
+            raise tm.MembraneError(
+                f"{path}: the views {', '.join(sensor.views_apart)} have images of their own; expected one view, or views that "
+                "are regions of one image, as the node takes the images of one topic: reconstruct a bag of all views"
+            )
+        (self.camera,) = sensor.image_cameras
         self.units = SiUnits(
             Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz")), sensor.gas_pressure
         )
