@@ -346,6 +346,70 @@ def test_rezero_takes_the_latest_image(system, levels):
     assert max(abs(each) for each in xyz(system.got["wrench"][1].wrench.force)) < 0.05
 
 
+def test_rezero_says_where_the_latest_image_is_old(system, levels, monkeypatch):
+    sent = system.publisher()
+    sent.publish(image(np.asarray(Picture.open(EXAMPLES / "rest.png").convert("L"))))
+    system.until(lambda: system.got["wrench"])
+    monkeypatch.setattr("torchmembrane_ros.node.SILENT", 0.1)
+    time.sleep(0.6)
+    told = system.call(Trigger, "torchmembrane/rezero", Trigger.Request())
+    assert told.success and "s old, and no later one could be followed" in told.message
+
+
+def test_stamps_that_no_clock_gives_do_not_stop_the_node(system, levels):
+    """Zero, as of a driver that sets none, tells no latency; a negative one, as of a clock that was never set, neither."""
+    sent = system.publisher()
+    for k, sec in enumerate((-5, 0)):
+        sent.publish(image(levels, sec=sec))
+        system.until(lambda k=k: len(system.got["wrench"]) == k + 1)
+    told = {each.fields["key"]: each.fields["value"] for each in system.node.health.message(2, 0.0).fields["values"]}
+    assert told["latency, ms (median)"] == "nan" and told["images followed"] == "2"
+    message = image(levels)
+    message.header.stamp = system.client.get_clock().now().to_msg()
+    sent.publish(message)
+    system.until(lambda: len(system.got["wrench"]) == 3)
+    told = {each.fields["key"]: each.fields["value"] for each in system.node.health.message(3, 0.0).fields["values"]}
+    assert 0 < float(told["latency, ms (median)"]) < 5000
+
+
+def test_an_error_of_one_image_does_not_end_the_node(system, levels, monkeypatch, capfd):
+    sent, follow = system.publisher(), system.node.follow
+
+    def follow_but_first(message):
+        if message.header.stamp.sec == 1:
+            raise RuntimeError("out of memory")
+        follow(message)
+
+    monkeypatch.setattr(system.node, "follow", follow_but_first)
+    sent.publish(image(levels, sec=1))
+    system.until(lambda: system.node.health.refused == 1)
+    sent.publish(image(levels))
+    system.until(lambda: system.got["wrench"])
+    assert "RuntimeError: out of memory" in capfd.readouterr().err
+
+
+def test_a_camera_that_is_lost_is_no_camera_whose_images_are_refused(sensor, monkeypatch):
+    """One image was refused once; afterwards images were followed, and then none came."""
+    health, now = Health(tm.Sensor.from_file(sensor), sensor), [0.0]
+    monkeypatch.setattr("torchmembrane_ros.health.time.monotonic", lambda: now[0])
+    health.refuse()
+    said = health.message(1, 0.0).fields["message"]
+    health.add(0.1, tm.Status.OK)
+    now[0] = 60.0
+    lost = health.message(2, 0.0).fields["message"]
+    health.refuse()
+    assert (said, lost) == ("images come, none can be followed", "no images come")
+    assert health.message(3, 0.0).fields["message"] == "images come, none can be followed"
+
+
+def test_an_image_of_few_bits_is_said_to_be_one(system, levels, capfd):
+    """10 bits in 16 that the sensor file does not state: the image is too dark to show dots."""
+    rng = np.random.default_rng(0)
+    system.publisher().publish(image(4 * levels.astype("<u2") + rng.integers(0, 4, levels.shape, dtype="<u2"), "mono16"))
+    system.until(lambda: system.got["status"])
+    assert "bits = 10" in capfd.readouterr().err
+
+
 def test_the_subscription_is_what_publishers_offer(system, levels):
     """Reliable, so that no colour image is lost, and best effort where a publisher offers no more."""
     assert system.node.reliability == RELIABLE
@@ -442,6 +506,8 @@ def test_transforms_of_two_fingers_reach_a_listener_that_comes_later(system_of, 
         ("right_flange", "right_camera"),
     }
     np.testing.assert_allclose(xyz(kept[0].transform.translation), [0.0015, 0, 0.03])
+    assert system.node.trigger_cleanup() == SUCCESS  # the pose of a sensor that is let go of reaches no later listener
+    system.until(lambda: system.client.count_publishers("/tf_static") == 1)
 
 
 def launched(name, monkeypatch, **arguments):

@@ -3,6 +3,7 @@
 import time
 from collections import Counter, deque
 from datetime import date
+from math import inf, isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ SILENT = 2.0
 
 
 class Followed(NamedTuple):
-    """A reconstructed image: time of completion (s), age of the image at that time (s), and status."""
+    """A reconstructed image: time of completion (s), age of the image at that time (s, NaN if unknown), and status."""
 
     time: float
     latency: float
@@ -38,7 +39,7 @@ class Health:
         self.written = date.fromtimestamp(path.stat().st_mtime)
         self.recent: deque[Followed] = deque(maxlen=RECENT)
         self.statuses: Counter[tm.Status] = Counter()
-        self.refused = 0
+        self.refused, self.refused_at = 0, -inf
 
     def add(self, latency: float, status: tm.Status) -> None:
         """Add a reconstructed image."""
@@ -48,6 +49,7 @@ class Health:
     def refuse(self) -> None:
         """Add an image that could not be read."""
         self.refused += 1
+        self.refused_at = time.monotonic()
 
     def message(self, received: int, drift: float) -> Message:
         """Return a `DiagnosticStatus`.
@@ -57,7 +59,7 @@ class Health:
             drift: drift of the tracker, px.
         """
         recent = list(self.recent)
-        times, latencies = [each.time for each in recent], [1000 * each.latency for each in recent]
+        times, latencies = [each.time for each in recent], [1000 * each.latency for each in recent if isfinite(each.latency)]
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
         median, most = np.percentile(latencies, [50, 99]) if latencies else (np.nan, np.nan)
         followed = self.statuses.total()
@@ -84,7 +86,9 @@ class Health:
     def _judged(self) -> tuple[int, str, str]:
         """Return level, name and text."""
         name = f"torchmembrane: {self.name}"
-        if not self.recent or time.monotonic() - self.recent[-1].time > SILENT:
-            return DOUBTFUL, name, "no images come" if not self.refused else "images come, none can be followed"
+        silent_since = time.monotonic() - SILENT
+        if not self.recent or self.recent[-1].time < silent_since:
+            is_refusing = self.refused_at > silent_since
+            return DOUBTFUL, name, "images come, none can be followed" if is_refusing else "no images come"
         status = self.recent[-1].status
         return GOOD if status == tm.Status.OK else DOUBTFUL if status.has_surface else FAILED, name, status.text

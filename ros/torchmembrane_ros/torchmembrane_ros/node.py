@@ -10,6 +10,7 @@ compared with the sensor file. The service `~/rezero` (std_srvs/Trigger) takes t
 
 import time
 import warnings
+from math import inf, nan
 from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
@@ -26,13 +27,14 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 import torchmembrane as tm
+from torchmembrane.files.levels import too_few_bits
 from torchmembrane.integrations.frame_messages import TOPICS, SiUnits
 from torchmembrane.integrations.messages import camera_mismatch, grey_of, info_topic
 from torchmembrane.live.mailbox import Mailbox
 from torchmembrane.results.store import Mesh, Settings
 
 from . import parameters
-from .health import Health
+from .health import SILENT, Health
 from .outgoing import make, transform_of, type_of
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -54,6 +56,8 @@ class TrackerNode(LifecycleNode):
         self.outputs: dict[str, Any] = {}
         self.subscriptions_made: list[Any] = []
         self.thread: Thread | None = None
+        self.transforms: Any = None
+        self.followed_at = -inf
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Read the sensor file and prepare for images."""
@@ -61,6 +65,7 @@ class TrackerNode(LifecycleNode):
             self._configure()
         except tm.MembraneError as error:
             self.get_logger().error(str(error))
+            self._release()
             return FAILURE
         except Exception as error:  # rclpy goes on to on_error without a word
             self.get_logger().error(f"{type(error).__name__}: {error}")
@@ -120,7 +125,10 @@ class TrackerNode(LifecycleNode):
             with self.lock, warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 self.tracker.rezero()
-            response.success, response.message = True, "; ".join(str(each.message) for each in said)
+                age = time.monotonic() - self.followed_at
+            remedy = "no later one could be followed: call again when images come"
+            told = [f"the latest image is {age:.0f} s old, and {remedy}"] if age > SILENT else []
+            response.success, response.message = True, "; ".join([*told, *(str(each.message) for each in said)])
         except tm.MembraneError as error:
             response.success, response.message = False, str(error)
         return response
@@ -140,6 +148,7 @@ class TrackerNode(LifecycleNode):
             with self.lock, warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 frame = self.tracker(grey).frame(0)
+                self.followed_at = time.monotonic()
         except tm.MembraneError as error:
             self.health.refuse()
             self.get_logger().warning(str(error), throttle_duration_sec=AGAIN)
@@ -148,12 +157,19 @@ class TrackerNode(LifecycleNode):
             self.get_logger().warning(str(each.message))
         status = tm.Status(int(frame["status"]))
         if not status.has_surface:
-            self.get_logger().warning(status.text, throttle_duration_sec=AGAIN)
+            hint = "" if self.health.statuses[status] else too_few_bits(grey)
+            self.get_logger().warning(f"{status.text}{hint}", throttle_duration_sec=AGAIN)
         header = Header(stamp=message.header.stamp, frame_id=self.get_parameter("frame_id").value or message.header.frame_id)
         for topic, each in self.units.messages(frame).items():
             self.outputs[topic].publish(each._replace(fields={"header": header, **each.fields}).built(make))
-        age = self.get_clock().now() - rclpy.time.Time.from_msg(message.header.stamp, self.get_clock().clock_type)
-        self.health.add(age.nanoseconds / 1e9, status)
+        self.health.add(self._age(message.header.stamp), status)
+
+    def _age(self, stamp: Any) -> float:
+        """Return the time since a stamp, s; NaN if the stamp is not set."""
+        if stamp.sec < 0 or not (stamp.sec or stamp.nanosec):
+            return nan
+        age = self.get_clock().now() - rclpy.time.Time.from_msg(stamp, self.get_clock().clock_type)
+        return float(age.nanoseconds / 1e9)
 
     def _configure(self) -> None:
         parameters.refuse_wrong(self)
@@ -210,9 +226,10 @@ class TrackerNode(LifecycleNode):
             if picture is not None:
                 try:
                     self.follow(picture.image)
-                except Exception:
+                except Exception as error:  # of whatever kind: the next image may be better
                     if self.context.ok():  # else ROS was ended while a message was on its way
-                        raise
+                        self.health.refuse()
+                        self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=AGAIN)
 
     def stop(self) -> None:
         """Stop the thread and unsubscribe from the images."""
@@ -230,7 +247,9 @@ class TrackerNode(LifecycleNode):
         if self.outputs:
             self.destroy_publisher(self.diagnostics)
             self.destroy_service(self.rezero_service)
-        self.outputs = {}
+        if self.transforms is not None:
+            self.destroy_publisher(self.transforms)
+        self.outputs, self.transforms = {}, None
 
 
 def main() -> None:
