@@ -52,6 +52,9 @@ class Model {
     explicit Model(const std::string& path)
         : session_(environment_, path.c_str(), one_thread()), known_(session_.GetModelMetadata()) {
         if (known("format") != "1") throw std::runtime_error(path + ": no model of `torchmembrane export`, format 1");
+        const std::string image = session_.GetInputNameAllocated(0, allocator_).get();
+        if (image.rfind("image_", 0) == 0)
+            throw std::runtime_error(path + ": takes an image for each view; expected a model of one image per frame");
         if (session_.GetInputCount() != 1)
             throw std::runtime_error(path + ": starts from the frame before; expected one exported without --tracking");
         size_ = session_.GetInputTypeInfo(0).GetTensorTypeAndShapeInfo().GetShape();  // batch, 1, height, width

@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import onnx
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -33,9 +34,24 @@ def main(frame: str, model: str, *images: str) -> None:
         Image.new("L", (7, 5), 128).save(grey)
         done = call(grey)
         assert done.returncode == 2 and "the image is 7 x 5 px, the sensor's are" in done.stderr, done
+        apart = Path(folder) / "apart.onnx"
+        apart.write_bytes(of_views(model))
+        done = subprocess.run([frame, apart, grey], capture_output=True, text=True)
+        assert done.returncode == 2 and "takes an image for each view" in done.stderr, done
         grey.write_bytes(grey.read_bytes()[:-1])
         done = call(grey)
         assert done.returncode == 2 and "ends before its last pixel" in done.stderr, done
+
+
+def of_views(path: str) -> bytes:
+    """Return a model that takes an image for each of two views and gives the first one; its metadata are those of a model."""
+    shape = ["batch", 1, 5, 7]
+    given = [onnx.helper.make_tensor_value_info(f"image_{name}", onnx.TensorProto.FLOAT, shape) for name in ("left", "right")]
+    seen = onnx.helper.make_tensor_value_info("seen", onnx.TensorProto.FLOAT, shape)
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["image_left"], ["seen"])], "views", given, [seen])
+    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    made.metadata_props.extend(onnx.load(path).metadata_props)
+    return made.SerializeToString()
 
 
 def compare(done: subprocess.CompletedProcess, session: Session, results: dict, image: str) -> None:
