@@ -8,7 +8,8 @@ const MESH = { rest_vertices: 3, rest_normals: 3, triangles: 3 }; // what is dra
 
 /**
  * The sensor of a model from `torchmembrane export`: name, lengthUnit, forceUnit, statusTexts (code to text), mesh
- * (rest_vertices [V][3], triangles [T][3], grid [2], image_size [2] ...); bits of the camera, where images of 16 hold fewer.
+ * (rest_vertices [V][3], triangles [T][3], grid [2] ...); imageSize [2] of its images, which several views may share; bits of
+ * the camera, where images of 16 hold fewer.
  */
 export function sensorOf(bytes) {
   const known = metadata(bytes);
@@ -16,10 +17,15 @@ export function sensorOf(bytes) {
   const missing = ["name", "length_unit", "force_unit", "status_texts", "mesh"].find((key) => !known[key]);
   if (missing) throw new Error(`its metadata lack ${missing}; expected ${EXPECTED}: export it again`);
   const [statusTexts, mesh] = ["status_texts", "mesh"].map((key) => parsed(key, known[key]));
+  const [views, part] = [String(mesh.view_names ?? "").split(" "), mesh.image_part ?? []];
+  if (views.length > 1 && part.length === 0) {
+    throw new Error(`it takes an image for each of the views ${views.join(", ")}; expected a model of one image per frame`);
+  }
   const bits = known.bits ? Number(known.bits) : undefined;
   const wrong = unlike(mesh) || (bits !== undefined && !(bits >= 8 && bits <= 16) && "bits");
   if (wrong) throw new Error(`its metadata are damaged (${wrong}); expected ${EXPECTED}: export it again`);
-  return { name: known.name, lengthUnit: known.length_unit, forceUnit: known.force_unit, statusTexts, mesh, bits };
+  const imageSize = part.length ? part.slice(2) : mesh.image_size;
+  return { name: known.name, lengthUnit: known.length_unit, forceUnit: known.force_unit, statusTexts, mesh, imageSize, bits };
 }
 
 function metadata(bytes) {
@@ -53,6 +59,8 @@ function unlike(mesh) {
   const counts = (list) => numbers(list, 2) && list.every((n) => Number.isInteger(n) && n > 0);
   const pair = ["grid", "image_size"].find((key) => !counts(mesh[key]));
   if (pair) return pair;
+  const part = mesh.image_part ?? [];
+  if (part.length !== 0 && !(numbers(part, 4) && counts(part.slice(2)))) return "image_part";
   const count = mesh.rest_vertices.length;
   if (mesh.grid[0] * mesh.grid[1] !== count || mesh.rest_normals.length !== count) return "grid";
   if (!mesh.triangles.flat().every((corner) => Number.isInteger(corner) && corner >= 0 && corner < count)) return "triangles";

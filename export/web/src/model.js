@@ -9,7 +9,7 @@ export class Model {
     const model = new Model();
     try {
       model.sensor = sensorOf(bytes);
-      const [width, height] = model.sensor.mesh.image_size;
+      const [width, height] = model.sensor.imageSize;
       model.tracks = (await model.#ask({ model: { bytes, width, height } })).tracks;
     } catch (error) {
       model.close();
@@ -20,7 +20,7 @@ export class Model {
 
   /** The result of an image's grey values [width * height]: `frame`, the outputs by name, and `milliseconds`. */
   run(grey) {
-    const [width, height] = this.sensor.mesh.image_size;
+    const [width, height] = this.sensor.imageSize;
     return this.#ask({ image: { grey, width, height } });
   }
 

@@ -36,9 +36,9 @@ async function openModel(file) {
 
 async function openImage(file, name) {
   if (!model) throw new Error("there is no model yet; open one first");
-  const { mesh, bits } = model.sensor;
-  const { pixels, grey } = await imageOf(file, mesh.image_size, bits);
-  const [width, height] = mesh.image_size;
+  const { imageSize, bits } = model.sensor;
+  const { pixels, grey } = await imageOf(file, imageSize, bits);
+  const [width, height] = imageSize;
   const { frame, milliseconds } = await model.run(grey);
   Object.assign(at("image"), { width, height });
   at("image").setAttribute("aria-label", name);

@@ -237,6 +237,8 @@ test("another model takes its place, what is none is refused in words", async ()
   for (const [name, said] of Object.entries({
     "no_mesh.onnx": "its metadata lack mesh",
     "no_size.onnx": "its metadata are damaged (image_size)",
+    "no_part.onnx": "its metadata are damaged (image_part)",
+    "apart.onnx": "it takes an image for each of the views left, right",
     "no_vertices.onnx": "its metadata are damaged (rest_vertices)",
     "no_texts.onnx": "its metadata are damaged (status_texts)",
     "cut.onnx": "onnxruntime cannot load it",
@@ -251,6 +253,13 @@ test("another model takes its place, what is none is refused in words", async ()
   await drop(reference("another.onnx"), reference("blank.png"));
   assert.equal(await text("#sensor"), "another sensor");
   assert.equal(await text("#name"), "blank.png");
+});
+
+test("a model of views that share an image takes the whole image", async () => {
+  await drop(reference("regions.onnx"), "examples/two_contacts.png");
+  assert.equal(await page.locator("#message").isHidden(), true);
+  assert.equal(await text("#sensor"), "two views");
+  agree(await compared("two_contacts"));
 });
 
 test("a model that tracks starts a frame from the one before, and from rest when told", async () => {

@@ -89,6 +89,12 @@ def models(path: Path, out: Path) -> None:
     for name, changed in {
         "another": {"name": "another sensor"},
         "twelve": {"bits": "12"},
+        "regions": {
+            "name": "two views",
+            "mesh": json.dumps(mesh | {"image_size": [320, 400], "image_part": [0, 0, *mesh["image_size"]]}),
+        },
+        "no_part": {"mesh": json.dumps(mesh | {"image_part": [0, 0, 640]})},
+        "apart": {"mesh": json.dumps(mesh | {"view_names": "left right"})},
         "no_mesh": {"mesh": ""},
         "no_size": {"mesh": json.dumps({key: value for key, value in mesh.items() if key != "image_size"})},
         "no_vertices": {"mesh": json.dumps(mesh | {"rest_vertices": [[0, 0], [1]]})},
