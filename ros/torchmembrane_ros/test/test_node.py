@@ -410,6 +410,20 @@ def test_an_image_of_few_bits_is_said_to_be_one(system, levels, capfd):
     assert "bits = 10" in capfd.readouterr().err
 
 
+def test_images_of_another_type_are_said_to_be_of_one(system, capfd):
+    apart = rclpy.Context()  # as of another process: within one, a topic has one type
+    rclpy.init(context=apart)
+    camera = rclpy.create_node("camera", context=apart)
+    camera.create_publisher(CompressedImage, "/finger/image", 5)
+    said = (
+        "/finger/image carries sensor_msgs/msg/CompressedImage; expected sensor_msgs/msg/Image, as the parameter compressed is"
+    )
+    heard = []
+    system.until(lambda: heard.append(capfd.readouterr().err) or said in "".join(heard))
+    camera.destroy_node()
+    rclpy.shutdown(context=apart)
+
+
 def test_the_subscription_is_what_publishers_offer(system, levels):
     """Reliable, so that no colour image is lost, and best effort where a publisher offers no more."""
     assert system.node.reliability == RELIABLE

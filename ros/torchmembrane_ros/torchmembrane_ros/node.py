@@ -137,6 +137,7 @@ class TrackerNode(LifecycleNode):
         """Publish the state of the node, and subscribe again if new image publishers offer another reliability."""
         status = self.health.message(self.mailbox.captured, self.tracker.drift).built(make)
         self.diagnostics.publish(DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[status]))
+        self._warn_of_other_types()
         if self._reliability() != self.reliability:
             self.destroy_subscription(self.subscriptions_made.pop())
             self.subscriptions_made.append(self._subscribe())
@@ -205,6 +206,15 @@ class TrackerNode(LifecycleNode):
         kept = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.transforms = self.create_publisher(TFMessage, "/tf_static", kept)
         self.transforms.publish(TFMessage(transforms=[transform]))
+
+    def _warn_of_other_types(self) -> None:
+        """Log that a publisher sends messages of another type on the topic of the images, which ROS drops without a word."""
+        topic, is_compressed = self.resolve_topic_name("image"), self.get_parameter("compressed").value
+        expected = f"sensor_msgs/msg/{'CompressedImage' if is_compressed else 'Image'}"
+        others = {each.topic_type for each in self.get_publishers_info_by_topic(topic)} - {expected}
+        if others:
+            said = f"{topic} carries {', '.join(sorted(others))}; expected {expected}"
+            self.get_logger().warning(f"{said}, as the parameter compressed is {is_compressed}", throttle_duration_sec=AGAIN)
 
     def _reliability(self) -> ReliabilityPolicy:
         """Return the reliability of the image subscription: as configured, or what all publishers offer."""
