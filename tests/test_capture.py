@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from PIL import Image
 from torchmembrane.cli.main import main
 from torchmembrane.files.timestamps import time_in
 from torchmembrane.live import capture
-from torchmembrane.live.capture import SETTLING, STALE, Held, Photographs, hold
+from torchmembrane.live.capture import SETTLING, STALE, Held, Photographs, hold, taken_together
 
 ROOT = Path(__file__).parents[1]
 AUTO = {"AUTO_EXPOSURE": 3.0, "AUTO_WB": 1.0, "AUTOFOCUS": 1.0}
@@ -113,6 +114,37 @@ def test_photographs_of_two_cameras_bear_the_names_of_their_views(monkeypatch, t
     names = sorted(path.stem for path in tmp_path.iterdir())
     assert [name.partition("_")[2] for name in names] == ["left", "right"] * 2 and names[0][:-5] == names[1][:-6]
     assert all(np.isfinite(time_in(name)) for name in names) and all(driver.released for driver in drivers.values())
+
+
+class Queue(Driver):
+    """A camera of 100 Hz whose driver keeps four images that nobody has read, and drops later ones; their level is the time,
+    hundredths of a second."""
+
+    def __init__(self):
+        super().__init__([])
+        self.start, self.waiting, self.taken = time.monotonic(), deque(), 0
+
+    def read(self):
+        while not self.waiting:
+            time.sleep(0.001)
+            self._fill()
+        self._fill()
+        return True, np.full((6, 8, 3), self.waiting.popleft(), np.uint16)
+
+    def _fill(self):
+        begun, self.taken = self.taken, int(100 * (time.monotonic() - self.start))
+        self.waiting.extend(list(range(begun + 1, self.taken + 1))[: 4 - len(self.waiting)])
+
+
+def test_photographs_of_two_cameras_are_of_the_same_moment(monkeypatch):
+    """However long the camera that is read later has waited: its driver still holds images of the photographs before."""
+    drivers = {}
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: drivers.setdefault(number, Queue()))
+    cameras = [Photographs(0), Photographs(1)]
+    for _, images in taken_together(cameras, 5, 0.4):
+        left, right = (driver.start + image[0, 0, 0] / 100 for driver, image in zip(drivers.values(), images, strict=True))
+        assert 0 <= right - left < 0.3 and time.monotonic() - left < 0.35
+    assert all(driver.released for driver in drivers.values())
 
 
 def test_two_photographs_in_one_millisecond_have_two_names(monkeypatch):

@@ -48,17 +48,17 @@ def run(arguments: Namespace) -> int:
     """Take the photographs; return the exit code."""
     from ..files.atomic import make_folder
     from ..files.images import write_as_taken
-    from ..live.capture import Photographs
+    from ..live.capture import Photographs, taken_together
 
     cameras = _cameras(arguments)
     photographs = {ending: Photographs(opened, size) for ending, (opened, size, _) in cameras.items()}
     for (opened, *_), each in zip(cameras.values(), photographs.values(), strict=True):
         print(f"camera {opened}: {each.settings.said}", flush=True)
     make_folder(arguments.out)
-    taken = zip(*(each.take(arguments.count, arguments.every) for each in photographs.values()), strict=True)
-    for number, images in enumerate(taken, 1):
-        for (ending, (_, _, bits)), (_, image) in zip(cameras.items(), images, strict=True):
-            path = write_as_taken(arguments.out / f"{images[0][0]}{ending}", image, bits)
+    taken = taken_together(list(photographs.values()), arguments.count, arguments.every)
+    for number, (name, images) in enumerate(taken, 1):
+        for (ending, (_, _, bits)), image in zip(cameras.items(), images, strict=True):
+            path = write_as_taken(arguments.out / f"{name}{ending}", image, bits)
             print(f"{number} of {arguments.count}: {path}", flush=True)
     height, width = image.shape[:2]
     print(f"{arguments.count} photographs of {width} x {height} px in {arguments.out}")

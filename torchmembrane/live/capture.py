@@ -1,7 +1,7 @@
 """Photographs taken with locked camera settings, for rest images and weights."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -14,6 +14,8 @@ SETTLING = 30
 """Number of images after which the camera's automatic settings have settled."""
 STALE = 3
 """Number of images in the driver's queue that were taken before the settings were locked."""
+QUEUED = 5
+"""Number of images after which a driver's queue holds none that was taken before."""
 NEAR = 1e-3
 """Largest relative difference between the value that was set and the value that is read back."""
 
@@ -100,6 +102,15 @@ class Photographs:
         for _ in range(count):
             next(self._images)
 
+    def newest(self) -> np.ndarray:
+        """Return an image that is taken from now on; those that wait in the driver are dropped."""
+        self._skip(QUEUED)
+        return next(self._images)
+
+    def close(self) -> None:
+        """Release the camera."""
+        self._images.close()
+
     def take(self, count: int, every: float = 0.0) -> Iterator[tuple[str, np.ndarray]]:
         """Yield `count` photographs, at least `every` seconds apart; the camera is released after the last one.
 
@@ -115,7 +126,26 @@ class Photographs:
                 due, taken = time.monotonic() + every, name
                 yield name, image
         finally:
-            self._images.close()
+            self.close()
+
+
+def taken_together(cameras: Sequence[Photographs], count: int, every: float = 0.0) -> Iterator[tuple[str, list[np.ndarray]]]:
+    """Yield `count` times the photographs of all cameras, each taken when the one before it is, whatever waits in the drivers.
+
+    Args:
+        cameras: one or more cameras, which are released after the last photographs.
+        count: number of photographs of each.
+        every: shortest time between two photographs of a camera, seconds.
+
+    Yields:
+        The name, as of `Photographs.take`, and the image of each camera.
+    """
+    try:
+        for name, image in cameras[0].take(count, every):
+            yield name, [image] if len(cameras) == 1 else [each.newest() for each in cameras]
+    finally:
+        for each in cameras:
+            each.close()
 
 
 def _name_now() -> str:
