@@ -1,11 +1,16 @@
 """Conversion of recorded runs to LeRobot data sets (v3): each folder of results becomes an episode."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import torchmembrane as tm
+from torchmembrane.files.order import in_order
+from torchmembrane.results.read import Results
+from torchmembrane.results.reconstruction import Frame
+from torchmembrane.results.summary import UNREADABLE, read_summary
 
 from . import tactile
 
@@ -37,12 +42,27 @@ def convert(folders: list[Path], root: Path, repo_id: str, name: str, fps: int, 
     dataset = LeRobotDataset.create(repo_id, fps, tactile.features(name, vertices), root=root, use_videos=False)
     for run in runs:
         area = vertex_areas(run.mesh.rest_vertices, run.mesh.triangles)
-        for frame in run:
-            values = tactile.felt(frame) | {"points": tactile.points(frame, area)}
+        for frame in moments_of(run):
+            if frame is None:
+                values = tactile.unreadable(vertices)
+            else:
+                values = tactile.felt(frame) | {"points": tactile.points(frame, area)}
             dataset.add_frame({tactile.key(name, what): value for what, value in values.items()} | {"task": task})
         dataset.save_episode()
     dataset.finalize()
     return LeRobotDataset(repo_id, root=root)
+
+
+def moments_of(run: Results) -> Iterator[Frame | None]:
+    """Yield the frames of a run in name order, and None for each image that could not be read: the others keep their times."""
+    try:
+        rows = read_summary(run.folder)
+    except tm.MembraneError:  # without a table, no such image is known
+        rows = []
+    unread = {row["name"] for row in rows if row["status"] == str(UNREADABLE)} - set(run.names)
+    frames = iter(run)
+    for name in sorted([*run.names, *unread], key=in_order):
+        yield None if name in unread else next(frames)
 
 
 def refuse_existing(root: Path) -> None:

@@ -9,6 +9,7 @@ from torchmembrane.results.reconstruction import Frame
 
 WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 CONTACTS = 4
+from torchmembrane.results.summary import UNREADABLE
 """Number of contacts of a frame, strongest first."""
 OF_CONTACT = ("x", "y", "z", "Fx", "Fy", "Fz")
 SIZES = {"wrench": 6, "contacts": CONTACTS * len(OF_CONTACT), "status": 1}
@@ -41,6 +42,12 @@ def scalars(frame: Frame, name: str) -> dict[str, float]:
     """Return wrench and status as the single numbers of a robot's observations: `NAME.Fx` ... `NAME.Mz`, `NAME.status`."""
     values = felt(frame)
     return dict(zip(scalar_names(name), [*values["wrench"].tolist(), *values["status"].tolist()], strict=True))
+
+def unreadable(vertices: int) -> dict[str, np.ndarray]:
+    """Return the values of an image that could not be read, which has no frame: zeros, and status -1."""
+    zeros = {name: np.zeros(size, np.float32) for name, size in SIZES.items()} | {"points": np.zeros((vertices, 6), np.float32)}
+    return zeros | {"status": np.full(1, UNREADABLE, np.float32)}
+
 
 
 def scalar_names(name: str) -> list[str]:

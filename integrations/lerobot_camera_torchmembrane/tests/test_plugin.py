@@ -1,5 +1,6 @@
 """The camera, the step and the converter as LeRobot uses them."""
 
+import shutil
 import subprocess
 import sys
 import time
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.cameras.configs import CameraConfig, Cv2Rotation
+from conftest import EXAMPLES
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.configs.types import PipelineFeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -183,7 +185,7 @@ def test_an_observation_without_the_image_is_refused(step, presses):
 
 
 def test_recorded_runs_load_as_a_data_set(sensor, tmp_path):
-    from conftest import EXAMPLES, PRESSES
+    from conftest import PRESSES
     from lerobot_camera_torchmembrane.commands import to_lerobot
 
     from torchmembrane.cli.main import main
@@ -202,7 +204,7 @@ def test_recorded_runs_load_as_a_data_set(sensor, tmp_path):
 
 
 def test_a_data_set_folder_is_loaded_by_datasets_offline(sensor, tmp_path):
-    from conftest import EXAMPLES, PRESSES
+    from conftest import PRESSES
     from datasets import load_dataset
 
     from torchmembrane.cli.main import main
@@ -237,4 +239,25 @@ def test_without_lerobot_s_data_sets_the_plugin_works_and_its_commands_name_what
         "sys.exit(lerobot_add(['runs/press', '--sensor', 'finger=sensor.toml']))\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+def test_an_image_that_cannot_be_read_keeps_its_place_in_time(sensor, tmp_path):
+    from conftest import PRESSES
+    from lerobot_camera_torchmembrane.commands import to_lerobot
+
+    from torchmembrane.cli.main import main
+
+    images = [tmp_path / f"press_{number}.png" for number in (1, 2, 10)]
+    for path, name in zip(images, PRESSES, strict=True):
+        shutil.copy(EXAMPLES / f"{name}.png", path)
+    images[1].write_bytes(b"cut off")
+    run, root = tmp_path / "run", tmp_path / "set"
+    assert main(["reconstruct", str(sensor), *map(str, images), "--out", str(run)]) == 1
+    assert to_lerobot([str(run), "--root", str(root), "--name", "finger", "--fps", "30"]) == 0
+    dataset, results = LeRobotDataset("local/tactile", root=root), tm.read_results(run)
+    status = [int(dataset[k]["observation.tactile.finger.status"]) for k in range(3)]
+    wrench = [dataset[k]["observation.tactile.finger.wrench"].numpy() for k in range(3)]
+    assert len(dataset) == 3 and status == [0, -1, 0] and not wrench[1].any()
+    np.testing.assert_allclose([wrench[0], wrench[2]], [frame["wrench"] for frame in results], rtol=1e-5)
+    assert float(dataset[2]["timestamp"]) == pytest.approx(2 / 30)
+
+
     assert done.returncode == 2 and 'pip install "lerobot[dataset]"' in done.stderr, done.stderr
