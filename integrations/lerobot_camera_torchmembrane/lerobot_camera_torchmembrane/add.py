@@ -39,6 +39,7 @@ def add(root: Path, sensors: dict[str, Path], out: Path, repo_id: str) -> LeRobo
     dataset = LeRobotDataset(f"local/{root.resolve().name}", root=root)
     trackers = {name: tm.Tracker(tm.Reconstructor.from_file(path)) for name, path in sensors.items()}
     for name, tracker in trackers.items():
+        tactile.refuse_views_apart(tracker.reconstructor.sensor, sensors[name])
         refuse_camera(dataset.meta.features, name, tracker.reconstructor.image_size)
     values = felt_in(dataset, trackers)
     declared = {key: each for name in sensors for key, each in tactile.features(name).items()}

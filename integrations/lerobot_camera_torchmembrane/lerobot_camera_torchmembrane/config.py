@@ -4,10 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-from lerobot.cameras.configs import CameraConfig
+from lerobot.cameras.configs import CameraConfig, ColorMode
 from lerobot.cameras.opencv import OpenCVCameraConfig
 
 from torchmembrane import MembraneError, Sensor
+
+from .tactile import refuse_views_apart
 
 
 @CameraConfig.register_subclass("torchmembrane")
@@ -21,8 +23,8 @@ class TorchMembraneCameraConfig(OpenCVCameraConfig):
             of `fps`.
 
     Raises:
-        MembraneError: the sensor file is invalid or has another width or height; or the file is not a video or has another
-            size.
+        MembraneError: the sensor file is invalid, has another width or height, or has views with images of their own; the
+            colours are not in the order red, green, blue; or the file is not a video or has another size.
     """
 
     sensor: str
@@ -35,7 +37,13 @@ class TorchMembraneCameraConfig(OpenCVCameraConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        size = Sensor.from_file(self.sensor).camera.image_size
+        if self.color_mode != ColorMode.RGB:
+            raise MembraneError(
+                f"color_mode: {self.color_mode.value}; expected rgb, as the grey of the dots is computed from it"
+            )
+        sensor = Sensor.from_file(self.sensor)
+        refuse_views_apart(sensor, self.sensor)
+        size = sensor.image_size
         given = self.width or size[0], self.height or size[1]
         if given != tuple(size):
             raise MembraneError(f"{self.sensor}: width x height = {given[0]} x {given[1]}; expected {size[0]} x {size[1]}")

@@ -27,7 +27,8 @@ class TactileProcessorStep(ObservationProcessorStep):
         name: name of the camera.
 
     Raises:
-        MembraneError: the sensor file is invalid, or an image is missing or has another size.
+        MembraneError: the sensor file is invalid or of views with images of their own; or an image is missing or has another
+            size.
 
     Limitations:
         Frames without a surface give zeros, which `status` reveals. All frames must come from one stream; `reset()` starts a
@@ -39,7 +40,9 @@ class TactileProcessorStep(ObservationProcessorStep):
     tracker: tm.Tracker = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self.tracker = tm.Tracker(tm.Reconstructor.from_file(self.sensor))
+        reconstructor = tm.Reconstructor.from_file(self.sensor)
+        tactile.refuse_views_apart(reconstructor.sensor, self.sensor)
+        self.tracker = tm.Tracker(reconstructor)
         self.tracker.warm_up()
         self.area = self.tracker.reconstructor.estimator.membrane.rest_area.numpy()
 

@@ -3,16 +3,32 @@
 They are zeros if a frame has no surface, because one NaN would spoil the statistics of a data set; `status` marks these frames.
 """
 
+from pathlib import Path
+
 import numpy as np
 
+from torchmembrane import MembraneError, Sensor
 from torchmembrane.results.reconstruction import Frame
+from torchmembrane.results.summary import UNREADABLE
 
 WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 CONTACTS = 4
-from torchmembrane.results.summary import UNREADABLE
 """Number of contacts of a frame, strongest first."""
 OF_CONTACT = ("x", "y", "z", "Fx", "Fy", "Fz")
 SIZES = {"wrench": 6, "contacts": CONTACTS * len(OF_CONTACT), "status": 1}
+
+
+def refuse_views_apart(sensor: Sensor, path: Path | str) -> None:
+    """Refuse a sensor whose views have images of their own: a camera of LeRobot gives one image.
+
+    Raises:
+        MembraneError: the sensor has such views.
+    """
+    if sensor.views_apart:
+        raise MembraneError(
+            f"{path}: the views {', '.join(sensor.views_apart)} have images of their own; expected a sensor file of one view, "
+            "or of views that are regions of one image"
+        )
 
 
 def felt(frame: Frame) -> dict[str, np.ndarray]:
@@ -25,6 +41,12 @@ def felt(frame: Frame) -> dict[str, np.ndarray]:
     contacts = np.concatenate([frame["contact_points"], frame["contact_force"]], -1).ravel()
     values = {"wrench": frame["wrench"], "contacts": contacts, "status": np.atleast_1d(frame["status"])}
     return {name: np.nan_to_num(value).astype(np.float32) for name, value in values.items()}
+
+
+def unreadable(vertices: int) -> dict[str, np.ndarray]:
+    """Return the values of an image that could not be read, which has no frame: zeros, and status -1."""
+    zeros = {name: np.zeros(size, np.float32) for name, size in SIZES.items()} | {"points": np.zeros((vertices, 6), np.float32)}
+    return zeros | {"status": np.full(1, UNREADABLE, np.float32)}
 
 
 def points(frame: Frame, area: np.ndarray) -> np.ndarray:
@@ -42,12 +64,6 @@ def scalars(frame: Frame, name: str) -> dict[str, float]:
     """Return wrench and status as the single numbers of a robot's observations: `NAME.Fx` ... `NAME.Mz`, `NAME.status`."""
     values = felt(frame)
     return dict(zip(scalar_names(name), [*values["wrench"].tolist(), *values["status"].tolist()], strict=True))
-
-def unreadable(vertices: int) -> dict[str, np.ndarray]:
-    """Return the values of an image that could not be read, which has no frame: zeros, and status -1."""
-    zeros = {name: np.zeros(size, np.float32) for name, size in SIZES.items()} | {"points": np.zeros((vertices, 6), np.float32)}
-    return zeros | {"status": np.full(1, UNREADABLE, np.float32)}
-
 
 
 def scalar_names(name: str) -> list[str]:

@@ -4,14 +4,15 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from importlib.metadata import requires
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from lerobot.cameras.configs import CameraConfig, Cv2Rotation
 from conftest import EXAMPLES
+from lerobot.cameras.configs import CameraConfig, Cv2Rotation
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.configs.types import PipelineFeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -24,6 +25,7 @@ from lerobot_camera_torchmembrane.versions import refuse_untested
 import torchmembrane as tm
 from torchmembrane.integrations.rerun import RerunLog
 from torchmembrane.results.store import Mesh, Settings
+from torchmembrane.sensor.views import View
 
 VERTICES = 81
 
@@ -122,10 +124,44 @@ def test_what_does_not_fit_the_sensor_file_is_refused(camera_of, counted, tmp_pa
         camera_of(counted, width=320)
     with pytest.raises(tm.MembraneError, match="frames of 640 x 480; expected 480 x 640"):
         camera_of(counted, rotation=90)
+    with pytest.raises(tm.MembraneError, match="color_mode: bgr; expected rgb"):
+        camera_of(counted, color_mode="bgr")
     broken = tmp_path / "broken.avi"
     broken.write_bytes(b"no video")
     with pytest.raises(tm.MembraneError, match="not readable as a video"):
         camera_of(broken)
+
+
+@pytest.fixture(scope="module")
+def sensor_of(tmp_path_factory):
+    """A file of the example's sensor with two views: both the left part of one image, or each with images of its own."""
+
+    def path_of(is_region):
+        one = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+        lens = one.camera.focal.tolist(), one.camera.centre.tolist(), one.camera.distortion.tolist()
+        part = tm.Camera(one.camera.model, (740, 480), *lens).in_mode((0, 0, 640, 480))
+        camera = part if is_region else one.camera
+        views = tuple(View(name, camera, rest_image=one.markers.rest_image, is_region=is_region) for name in ("a", "b"))
+        markers = replace(one.markers, rest_image=None)
+        two = replace(one, membrane=one.surface.membrane((9, 9)), camera=camera, markers=markers, views=views)
+        return two.to_file(tmp_path_factory.mktemp("views") / "sensor.toml")
+
+    return path_of
+
+
+def test_a_camera_of_views_that_share_an_image_gives_the_whole_image(sensor_of):
+    config = CameraConfig.get_choice_class("torchmembrane")(sensor=str(sensor_of(is_region=True)), fps=30)
+    assert (config.width, config.height) == (740, 480)
+
+
+def test_views_with_images_of_their_own_are_refused(sensor_of):
+    path = str(sensor_of(is_region=False))
+    for make in (
+        lambda: CameraConfig.get_choice_class("torchmembrane")(sensor=path, fps=30),
+        lambda: ProcessorStepRegistry.get("torchmembrane_tactile")(sensor=path, name="finger"),
+    ):
+        with pytest.raises(tm.MembraneError, match="the views a, b have images of their own"):
+            make()
 
 
 @pytest.fixture(scope="module")
@@ -203,6 +239,27 @@ def test_recorded_runs_load_as_a_data_set(sensor, tmp_path):
         np.testing.assert_allclose(item["contacts"].reshape(4, 6)[0, 3:], frame["contact_force"][0], rtol=1e-5)
 
 
+def test_an_image_that_cannot_be_read_keeps_its_place_in_time(sensor, tmp_path):
+    from conftest import PRESSES
+    from lerobot_camera_torchmembrane.commands import to_lerobot
+
+    from torchmembrane.cli.main import main
+
+    images = [tmp_path / f"press_{number}.png" for number in (1, 2, 10)]
+    for path, name in zip(images, PRESSES, strict=True):
+        shutil.copy(EXAMPLES / f"{name}.png", path)
+    images[1].write_bytes(b"cut off")
+    run, root = tmp_path / "run", tmp_path / "set"
+    assert main(["reconstruct", str(sensor), *map(str, images), "--out", str(run)]) == 1
+    assert to_lerobot([str(run), "--root", str(root), "--name", "finger", "--fps", "30"]) == 0
+    dataset, results = LeRobotDataset("local/tactile", root=root), tm.read_results(run)
+    status = [int(dataset[k]["observation.tactile.finger.status"]) for k in range(3)]
+    wrench = [dataset[k]["observation.tactile.finger.wrench"].numpy() for k in range(3)]
+    assert len(dataset) == 3 and status == [0, -1, 0] and not wrench[1].any()
+    np.testing.assert_allclose([wrench[0], wrench[2]], [frame["wrench"] for frame in results], rtol=1e-5)
+    assert float(dataset[2]["timestamp"]) == pytest.approx(2 / 30)
+
+
 def test_a_data_set_folder_is_loaded_by_datasets_offline(sensor, tmp_path):
     from conftest import PRESSES
     from datasets import load_dataset
@@ -239,25 +296,4 @@ def test_without_lerobot_s_data_sets_the_plugin_works_and_its_commands_name_what
         "sys.exit(lerobot_add(['runs/press', '--sensor', 'finger=sensor.toml']))\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-def test_an_image_that_cannot_be_read_keeps_its_place_in_time(sensor, tmp_path):
-    from conftest import PRESSES
-    from lerobot_camera_torchmembrane.commands import to_lerobot
-
-    from torchmembrane.cli.main import main
-
-    images = [tmp_path / f"press_{number}.png" for number in (1, 2, 10)]
-    for path, name in zip(images, PRESSES, strict=True):
-        shutil.copy(EXAMPLES / f"{name}.png", path)
-    images[1].write_bytes(b"cut off")
-    run, root = tmp_path / "run", tmp_path / "set"
-    assert main(["reconstruct", str(sensor), *map(str, images), "--out", str(run)]) == 1
-    assert to_lerobot([str(run), "--root", str(root), "--name", "finger", "--fps", "30"]) == 0
-    dataset, results = LeRobotDataset("local/tactile", root=root), tm.read_results(run)
-    status = [int(dataset[k]["observation.tactile.finger.status"]) for k in range(3)]
-    wrench = [dataset[k]["observation.tactile.finger.wrench"].numpy() for k in range(3)]
-    assert len(dataset) == 3 and status == [0, -1, 0] and not wrench[1].any()
-    np.testing.assert_allclose([wrench[0], wrench[2]], [frame["wrench"] for frame in results], rtol=1e-5)
-    assert float(dataset[2]["timestamp"]) == pytest.approx(2 / 30)
-
-
     assert done.returncode == 2 and 'pip install "lerobot[dataset]"' in done.stderr, done.stderr
