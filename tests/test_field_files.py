@@ -122,3 +122,6 @@ def test_rerun_shows_the_fields(results, tmp_path, monkeypatch):
     recorder.logged.clear()
     log.add(1, {key: value for key, value in frame.items() if key not in FIELDS})
     assert not [path for path in recorder.logged if "fields" in path or "largest" in path]
+    lost = {key: np.full_like(frame[key], np.nan) for key in FIELDS} | {"status": np.array(4)}  # no surface: none stays drawn
+    log.add(2, frame | lost)
+    assert {recorder.logged[path][0] for path in ("surface/now", *(f"fields/{name}" for name in FIELDS))} == {"Clear"}

@@ -91,7 +91,8 @@ class RerunLog:
             self._add_fields(frame)
             self._add_curves(frame)
         else:
-            self._log("surface/now", self._rr.Clear(recursive=True))
+            for path in ("surface/now", *(f"fields/{name}" for name in FIELDS if name in frame)):
+                self._log(path, self._rr.Clear(recursive=True))
 
     def _add_rest(self) -> None:
         rr, mesh = self._rr, self._mesh
