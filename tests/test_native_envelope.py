@@ -1,4 +1,4 @@
-"""The matrix of a step is stored within its envelope, and factored and solved there, by machine code."""
+"""A matrix is stored, factored and solved within its envelope."""
 
 import itertools
 

@@ -251,8 +251,11 @@ def _entry(sources: str) -> Any:
     return frames
 
 
-USED = camera_motion, cavity, equations, gauss_newton, layout, markers, native_envelope, native_membrane, native_rows, robust
-SOURCES = fingerprint(__file__, *(each.__file__ for each in (*USED, schedule, solution, spread, symmetric_2x2, vectors)))
+SOURCES = fingerprint(
+    __file__,
+    *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, layout, markers, native_envelope)),
+    *(each.__file__ for each in (native_membrane, native_rows, robust, schedule, solution, spread, symmetric_2x2, vectors)),
+)
 frames = _entry(SOURCES)
 compiled = Kept(frames, SOURCES)
 """For which precisions `frames` has been compiled."""
