@@ -38,7 +38,9 @@ def on_cpu(target: Built) -> Built:
     def called(*arguments: Any, **options: Any) -> Any:
         if torch.compiler.is_compiling():
             return target(*arguments, **options)
-        with torch.device("cpu"), without_autocast("cpu"):
+        # within a default device every torch function is called from Python, which a calibration would feel
+        device = nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu")
+        with device, without_autocast("cpu"):
             return target(*arguments, **options)
 
     return called  # type: ignore[return-value]
