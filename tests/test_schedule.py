@@ -284,6 +284,13 @@ def test_the_shear_of_a_sliding_contact_costs_as_much_as_its_push():
         assert cost.item() == pytest.approx(SETTINGS.tau[1] ** 2 / 2, rel=0.02)
 
 
+def test_what_is_no_setting_follows_from_the_settings():
+    """Shear is linear above an eighth of the last scale of a push; far pushes count for a quarter of near ones."""
+    assert SETTINGS.slip == pytest.approx(0.05) and SETTINGS.far_share == pytest.approx(0.05)
+    other = ForceBalanceSettings(tau=(8.0, 0.8), scale_share=0.6)
+    assert other.slip == pytest.approx(2 * SETTINGS.slip) and other.far_share == pytest.approx(3 * SETTINGS.far_share)
+
+
 def test_a_solution_has_converged_if_its_last_step_was_short_and_its_volume_is_kept(dented):
     """Just below and just above what is allowed of either, and a volume that is as much too small."""
     one = estimator()
